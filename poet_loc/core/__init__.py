@@ -1,0 +1,1 @@
+"""The vocabulary: geometry, records, trajectories and errors, on numpy and scipy alone."""

@@ -1,0 +1,28 @@
+"""Where tests find the shared data and fixtures: beside the repository, and skipped with a reason where missing."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+SHARED = Path(__file__).resolve().parents[2] / "shared"
+
+
+def _shared_folder(name: str) -> Path:
+    folder = SHARED / name
+    if not folder.is_dir():
+        pytest.skip(f"the shared folder {name} is not beside this checkout")
+    return folder
+
+
+@pytest.fixture(scope="session")
+def shared_data() -> Path:
+    """Folder with ycbv_dope/ and euroc_v101/."""
+    return _shared_folder("data")
+
+
+@pytest.fixture(scope="session")
+def shared_fixtures() -> Path:
+    """Folder with poet_official/."""
+    return _shared_folder("fixtures")
