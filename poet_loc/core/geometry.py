@@ -32,7 +32,7 @@ def so3_left_jacobian(rotvec: ArrayLike) -> Array:
     angle = np.linalg.norm(rotvec, axis=-1)[..., None, None]
     small = angle < _SMALL_ANGLE
     safe = np.where(small, 1.0, angle)
-    first = np.where(small, 0.5 - angle**2 / 24.0, (1.0 - np.cos(safe)) / safe**2)
+    first = np.where(small, 0.5 - angle**2 / 24.0, 2.0 * np.sin(0.5 * safe) ** 2 / safe**2)  # 1 - cos, uncancelled
     second = np.where(small, 1.0 / 6.0 - angle**2 / 120.0, (safe - np.sin(safe)) / safe**3)
     cross = skew(rotvec)
     return np.eye(3) + first * cross + second * cross @ cross
@@ -50,9 +50,7 @@ def so3_left_jacobian_inverse(rotvec: ArrayLike) -> Array:
     small = angle < _SMALL_ANGLE
     safe = np.where(small, 1.0, angle)
     half = 0.5 * safe
-    second = np.where(
-        small, 1.0 / 12.0 + angle**2 / 720.0, (1.0 - half * np.cos(half) / np.sin(half)) / safe**2
-    )
+    second = np.where(small, 1.0 / 12.0 + angle**2 / 720.0, (1.0 - half * np.cos(half) / np.sin(half)) / safe**2)
     cross = skew(rotvec)
     return np.eye(3) - 0.5 * cross + second * cross @ cross
 
@@ -109,4 +107,4 @@ def chordal_mean(rotations: ArrayLike, weights: ArrayLike) -> Array:
 
 def yaw_pitch_roll(rotation: Rotation) -> Array:
     """Return intrinsic z-y-x angles (yaw, pitch, roll) in rad, (3,) or (N, 3); pitch in [-pi/2, pi/2]."""
-    return np.asarray(rotation.as_euler("ZYX"))
+    return np.asarray(rotation.as_euler("ZYX", suppress_warnings=True))  # at the lock roll is 0

@@ -44,7 +44,8 @@ class Trajectory:
     def interpolate(self, stamps_ns: Stamps, max_gap_ns: int | None = None) -> tuple[RigidTransform, NDArray[np.bool_]]:
         """Return the poses at other stamps, along the SE(3) geodesic between neighbours, and which are valid.
 
-        A stamp outside the span, or inside a gap longer than max_gap_ns, is not valid and gets the nearest pose.
+        A stamp outside the span is not valid and gets the nearest pose; one inside a gap longer than max_gap_ns is not
+        valid either.
         """
         if len(self) == 0:
             raise ValueError("an empty trajectory has no pose to interpolate")
@@ -63,7 +64,9 @@ class Trajectory:
         return poses, valid
 
 
-def match_stamps(stamps_a: Stamps, stamps_b: Stamps, max_difference_ns: int) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+def match_stamps(
+    stamps_a: Stamps, stamps_b: Stamps, max_difference_ns: int
+) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
     """Return index pairs (i, j) of mutually nearest stamps at most max_difference_ns apart, in order of time."""
     if len(stamps_a) == 0 or len(stamps_b) == 0:
         return np.empty(0, np.intp), np.empty(0, np.intp)
