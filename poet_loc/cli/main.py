@@ -1,0 +1,127 @@
+"""The command line: names the commands, reads their options, and turns a user's mistake into one line.
+
+A command is a module of this package with a frozen dataclass `Arguments` and a function `execute(arguments)`; only the
+module of the command that was asked for is imported.
+"""
+
+from __future__ import annotations
+
+import sys
+import warnings
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from importlib import import_module
+from io import StringIO
+from typing import Any
+
+from poet_loc.core.input_error import InputError
+
+COMMANDS = {
+    "demo": "the embedded default from end to end: a simulated log, then everything that run does",
+    "run": "localise in all modes, fuse with all estimators, evaluate, draw and record",
+    "localize": "object poses and a landmark map become camera poses",
+    "fuse": "camera or object poses and a motion source become a trajectory with its sigmas",
+    "evaluate": "errors of a trajectory against a reference, per axis, APE and RPE",
+    "table": "the localisation table of one log or several: detections x modes",
+    "convert": "bring data from other formats into a log folder",
+    "simulate": "write a simulated log folder, or run many simulated logs through the estimators",
+    "view": "open the recording of a run in rerun",
+}
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run a command and return its exit status: 0, 1 after a user's mistake, 130 after Ctrl-C."""
+    argv = list(sys.argv[1:] if arguments is None else arguments)
+    try:
+        with _warnings_as_lines():
+            dispatch("poet-loc", COMMANDS, "poet_loc.cli", argv)
+            sys.stdout.flush()
+    except InputError as error:
+        return _one_line(str(error), 1)
+    except KeyboardInterrupt:
+        return _one_line("interrupted", 130)
+    except BrokenPipeError:
+        sys.stdout = StringIO()  # the reader has gone: nothing to flush at exit
+        return 0
+    except OSError as error:
+        if error.filename is None or error.strerror is None:
+            raise
+        return _one_line(f"{error.filename}: {error.strerror.lower()}", 1)
+    return 0
+
+
+def dispatch(program: str, commands: Mapping[str, str], package: str, argv: Sequence[str]) -> None:
+    """Run the command that argv names, from the module of that name in the package."""
+    name = argv[0] if argv else "--help"
+    if name in ("-h", "--help"):
+        print(_overview(program, commands))
+        return
+    if name == "--version":
+        from importlib.metadata import version
+
+        print(f"poet-loc {version('poet-loc')}")
+        return
+    if name not in commands:
+        raise InputError(f"unknown command '{name}'", fix=f"one of {', '.join(commands)}")
+    module = import_module(f"{package}.{name.replace('-', '_')}")
+    if hasattr(module, "COMMANDS"):
+        dispatch(f"{program} {name}", module.COMMANDS, f"{package}.{name}_commands", argv[1:])
+        return
+    options = read_arguments(f"{program} {name}", module.Arguments, argv[1:])
+    if options is not None:
+        module.execute(options)
+
+
+def read_arguments(program: str, kind: type, argv: Sequence[str]) -> Any:
+    """Return the dataclass that the arguments describe, or None where help was asked for and printed."""
+    import tyro
+
+    complaint = StringIO()
+    stderr, sys.stderr = sys.stderr, complaint
+    try:
+        return tyro.cli(kind, prog=program, args=list(argv))
+    except SystemExit as leaving:
+        if leaving.code in (0, None):
+            return None
+        raise InputError(_unboxed(complaint.getvalue()), fix=f"see {program} --help") from None
+    finally:
+        sys.stderr = stderr
+
+
+def _unboxed(text: str) -> str:
+    """Return the sentences inside tyro's box, without the frame and the pointer to the help."""
+    sections: list[list[str]] = [[]]
+    for line in text.splitlines():
+        if line.startswith("╭") or line.startswith("╰"):
+            continue
+        words = line.strip("│ ")
+        if words.startswith("──"):
+            sections.append([])
+        else:
+            sections[-1].append(words)
+    sentences = [" ".join(section) for section in sections]
+    told = [s for s in sentences if s and not s.startswith(("For full helptext", "Argument helptext"))]
+    return "; ".join(told) or "these arguments cannot be read"
+
+
+def _overview(program: str, commands: Mapping[str, str]) -> str:
+    width = max(map(len, commands)) + 2
+    lines = [f"usage: {program} COMMAND ...", ""]
+    lines += [f"  {name:{width}}{what}" for name, what in commands.items()]
+    lines += ["", f"{program} COMMAND --help tells the options of a command."]
+    return "\n".join(lines)
+
+
+def _one_line(message: str, status: int) -> int:
+    print(f"poet-loc: {message}", file=sys.stderr)
+    return status
+
+
+@contextmanager
+def _warnings_as_lines() -> Iterator[None]:
+    def show(message: Warning | str, *_: object, **__: object) -> None:
+        print(f"poet-loc: warning: {' '.join(str(message).split())}", file=sys.stderr)
+
+    with warnings.catch_warnings():
+        warnings.showwarning = show
+        yield
