@@ -1,0 +1,90 @@
+"""TUM trajectories: t tx ty tz qx qy qz qw, seconds with up to nine decimals, never through a float."""
+
+from __future__ import annotations
+
+from decimal import Decimal, InvalidOperation
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from poet_loc.core.trajectory import Trajectory
+from poet_loc.io.number_table import NumberTable, read_number_rows
+from poet_loc.io.pose_columns import POSE_COLUMNS, pose_cells, poses_of
+from poet_loc.io.whole_folder import write_whole_file
+
+Stamps = NDArray[np.int64]
+
+_NS_PER_S = 10**9
+_INT64_MAX = np.iinfo(np.int64).max
+
+
+def read_tum(path: str | Path) -> Trajectory:
+    """Read a trajectory: stamps exact to the nanosecond, metres, q_xyzw; `#` starts a comment.
+
+    Raises InputError, with the line, for a malformed row, a bad quaternion and stamps that do not increase.
+    """
+    table = read_number_rows(path, [("t", "S64"), *((name, float) for name in POSE_COLUMNS)], comments="#")
+    T_world_body = poses_of(table)
+    stamps = _stamps_of(table)
+    step = np.diff(stamps, prepend=stamps[0] - 1)
+    table.refuse(step < 0, "the stamp goes backwards", "sort the rows by time")
+    table.refuse(step == 0, "the stamp is there twice", "keep one row per stamp, with enough decimals")
+    return Trajectory(stamps, T_world_body)
+
+
+def write_tum(path: str | Path, trajectory: Trajectory) -> None:
+    """Write a trajectory, stamps with nine decimals."""
+    columns = [map(repr, column.tolist()) for column in pose_cells(trajectory.T_world_body)]
+    rows = zip(map(seconds_text, trajectory.stamps_ns.tolist()), *columns, strict=True)
+    write_whole_file(path, (" ".join(row) + "\n" for row in rows))
+
+
+def seconds_text(stamp_ns: int) -> str:
+    """Return a stamp in seconds with nine decimals, exactly."""
+    seconds, rest = divmod(abs(stamp_ns), _NS_PER_S)
+    return f"{'-' if stamp_ns < 0 else ''}{seconds}.{rest:09d}"
+
+
+def _stamps_of(table: NumberTable) -> Stamps:
+    texts = table["t"]
+    stamps, plain = _plain_decimals(texts)
+    for row in np.flatnonzero(~plain):
+        value = _nanoseconds(texts[row].decode(errors="replace"))
+        if value is None or abs(value) > _INT64_MAX:
+            what = f"{texts[row].decode(errors='replace')!r} is no time in seconds"
+            table.refuse(np.arange(len(table)) == row, what, "TUM wants seconds, for example 1403715273.312140000")
+        else:
+            stamps[row] = value
+    return stamps
+
+
+def _plain_decimals(texts: NDArray[Any]) -> tuple[Stamps, NDArray[np.bool_]]:
+    """Return nanoseconds of texts such as b"1600059000.033333333", and which texts have that plain form."""
+    width = texts.dtype.itemsize
+    characters = texts.view(np.uint8).reshape(len(texts), width)
+    length = np.count_nonzero(characters, axis=1)
+    is_dot = characters == ord(".")
+    is_digit = (characters >= ord("0")) & (characters <= ord("9"))
+    dots = is_dot.sum(axis=1)
+    point = np.where(dots > 0, is_dot.argmax(axis=1), length)
+    decimals = np.maximum(length - point - 1, 0)
+    plain = (dots <= 1) & (is_digit.sum(axis=1) + dots == length) & (decimals <= 9) & (point >= 1) & (point <= 10)
+    value = np.zeros(len(texts), np.uint64)  # 19 digits fit
+    for column in range(int(length.max(initial=0))):
+        digit = is_digit[:, column] & plain
+        value[digit] = value[digit] * np.uint64(10) + (characters[digit, column] - ord("0"))
+    value *= np.uint64(10) ** (9 - np.minimum(decimals, 9)).astype(np.uint64)
+    plain &= value <= _INT64_MAX
+    return np.where(plain, value, 0).astype(np.int64), plain
+
+
+def _nanoseconds(text: str) -> int | None:
+    try:
+        seconds = Decimal(text)
+    except InvalidOperation:
+        return None
+    if "_" in text or not seconds.is_finite() or seconds.adjusted() > 10:
+        return None
+    return int((seconds * _NS_PER_S).to_integral_value())
