@@ -108,7 +108,7 @@ def _forward(value, levels, locations, weights, out, width, first, last):  # typ
                 x, y = locations[query, head, i, 0], locations[query, head, i, 1]
                 share = weights[query, head, i]
                 _corners(x, y, share, levels[0, i], levels[1, i], levels[2, i], stride, offset, index, weight, 4 * i)
-            _sum_rows(out, query * heads * depth + offset, value, index, weight, samples, width)
+            _sum_rows(out, query * heads * depth + offset, value, index, weight, samples, width)  # type: ignore[call-arg]
 
 
 @numba.njit(fastmath=_FAST, error_model="numpy", nogil=True, cache=True)
