@@ -70,8 +70,8 @@ def match_stamps(
     """Return index pairs (i, j) of mutually nearest stamps at most max_difference_ns apart, in order of time."""
     if len(stamps_a) == 0 or len(stamps_b) == 0:
         return np.empty(0, np.intp), np.empty(0, np.intp)
-    nearest_b = _nearest(stamps_a, stamps_b)
-    nearest_a = _nearest(stamps_b, stamps_a)
+    nearest_b = nearest_stamps(stamps_a, stamps_b)
+    nearest_a = nearest_stamps(stamps_b, stamps_a)
     index_a = np.arange(len(stamps_a))
     mutual = nearest_a[nearest_b] == index_a
     close = np.abs(stamps_a - stamps_b[nearest_b]) <= max_difference_ns
@@ -79,7 +79,8 @@ def match_stamps(
     return index_a[keep], nearest_b[keep]
 
 
-def _nearest(queries: Stamps, sorted_stamps: Stamps) -> NDArray[np.intp]:
+def nearest_stamps(queries: Stamps, sorted_stamps: Stamps) -> NDArray[np.intp]:
+    """Return the index of the stamp nearest each query, the earlier of two equally near; sorted_stamps not empty."""
     right = np.clip(np.searchsorted(sorted_stamps, queries), 1, max(len(sorted_stamps) - 1, 1))
     left = right - 1
     right = np.minimum(right, len(sorted_stamps) - 1)
