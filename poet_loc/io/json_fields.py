@@ -62,16 +62,16 @@ def unit_quaternion(value: Any, name: str) -> Rotation:
     return Rotation.from_quat(q_xyzw)
 
 
-def is_rotation(matrix: Array) -> bool:
-    """Return whether a 3x3 matrix is a proper rotation up to the rounding of a few digits."""
-    off = np.abs(matrix @ matrix.T - np.eye(3)).max()
-    return bool(off < _ROTATION_TOLERANCE and np.linalg.det(matrix) > 0)
+def are_rotations(matrices: Array) -> NDArray[np.bool_]:
+    """Return which 3x3 matrices are proper rotations up to rounding and a network's slips.  (..., 3, 3) -> (...)."""
+    off = np.abs(matrices @ np.swapaxes(matrices, -1, -2) - np.eye(3)).max(axis=(-1, -2))
+    return (off < _ROTATION_TOLERANCE) & (np.linalg.det(matrices) > 0)
 
 
 def rigid_matrix(value: Any, name: str) -> RigidTransform:
     """Return a transform from a 4x4 matrix.  Raises FieldError where it is none."""
     matrix = numbers(value, name, (4, 4))
-    if not is_rotation(matrix[:3, :3]):
+    if not are_rotations(matrix[:3, :3]):
         raise FieldError(f"{name} holds no rotation: its 3x3 block is not orthonormal with determinant +1")
     if not np.allclose(matrix[3], [0, 0, 0, 1]):
         raise FieldError(f"{name} does not end in the row 0 0 0 1")

@@ -70,13 +70,23 @@ def read_log(path: str | Path, detections: str | None = None) -> Log:
     Raises InputError for a folder that is no log, streams without a common time span, detections of objects that the
     map does not have, and whatever the readers of the files refuse.
     """
+    log = read_log_files(path, detections)
+    if log.camera_poses is None and (not log.object_poses or log.landmark_map is None):
+        missing = "landmarks.json" if log.object_poses else "object_poses.csv"
+        raise InputError(f"has no {missing}", path=path, fix=_FIX)
+    check_log(log)
+    return log
+
+
+def read_log_files(path: str | Path, detections: str | None = None) -> Log:
+    """Read whatever files of a log a folder has, without asking whether they are enough or belong together."""
     path = Path(path)
     files = _object_pose_files(path)
     if detections is not None:
         if detections not in files:
             raise _no_such_detections(path, detections, sorted(files))
         files = {detections: files[detections]}
-    log = Log(
+    return Log(
         path=path,
         object_poses={name: read_object_poses(file) for name, file in files.items()},
         landmark_map=_read_if_there(path / "landmarks.json", read_landmarks),
@@ -88,12 +98,12 @@ def read_log(path: str | Path, detections: str | None = None) -> Log:
         T_odom_cam=_read_if_there(path / "T_odom_cam.tum", read_tum),
         frames=_read_if_there(path / "frames.csv", read_frames),
     )
-    if log.camera_poses is None and (not log.object_poses or log.landmark_map is None):
-        missing = "landmarks.json" if log.object_poses else "object_poses.csv"
-        raise InputError(f"has no {missing}", path=path, fix=_FIX)
+
+
+def check_log(log: Log) -> None:
+    """Raise InputError where the records do not belong together: unknown objects, no common time span."""
     _refuse_unknown_objects(log)
     _refuse_separate_spans(log)
-    return log
 
 
 def write_log(path: str | Path, log: Log) -> None:
@@ -148,7 +158,8 @@ def _refuse_unknown_objects(log: Log) -> None:
             file = log.path / _object_poses_file(name)
             what = f"object {unknown[0]} is not in the map (it has {', '.join(map(str, sorted(set(known.tolist()))))})"
             fix = f"add it to {log.path / 'landmarks.json'} or leave its rows out"
-            raise InputError(what, path=file, line=line_of_object(file, int(unknown[0])), fix=fix)
+            line = line_of_object(file, int(unknown[0])) if file.exists() else None
+            raise InputError(what, path=file, line=line, fix=fix)
 
 
 def _refuse_separate_spans(log: Log) -> None:

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from poet_loc.core.records import ObjectPoses
 from poet_loc.io.number_table import NumberTable, read_number_csv, write_csv
@@ -65,6 +67,19 @@ def line_of_object(path: str | Path, object_id: int) -> int:
     """Return the first line of a well-formed file that holds an object."""
     table = _read_table(path)
     return table.line(int(np.argmax(table["object_id"] == object_id)))
+
+
+def count_instances(images: NDArray[Any], object_ids: NDArray[Any]) -> NDArray[np.int64]:
+    """Return 0, 1, 2 .. for the detections of one object in one image, in their order.  (N,), (N,) -> (N,)."""
+    if len(images) == 0:
+        return np.empty(0, np.int64)
+    order = np.lexsort((object_ids, images))
+    starts = np.ones(len(order), bool)
+    starts[1:] = (np.diff(images[order]) != 0) | (np.diff(object_ids[order]) != 0)
+    position = np.arange(len(order))
+    instances = np.empty(len(order), np.int64)
+    instances[order] = position - np.maximum.accumulate(np.where(starts, position, 0))
+    return instances
 
 
 def _read_table(path: str | Path) -> NumberTable:

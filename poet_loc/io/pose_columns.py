@@ -70,15 +70,16 @@ def pose_cells(T: RigidTransform) -> list[Array]:
 
 def not_positive_definite(covariances: Array) -> NDArray[np.bool_]:
     """Return which of (N, 6, 6) matrices are no covariance, (N,); rounding to a few digits is forgiven."""
+    try:
+        if np.isfinite(np.linalg.cholesky(covariances)).all():
+            return np.zeros(len(covariances), bool)
+    except np.linalg.LinAlgError:
+        pass
     variances = np.einsum("nii->ni", covariances)
     bad = ~np.isfinite(covariances).all(axis=(1, 2)) | ~(variances > 0).all(axis=1)
     sigmas = np.sqrt(np.where(bad[:, None], 1.0, variances))
-    correlation = np.where(bad[:, None, None], np.eye(6), covariances) / (sigmas[:, :, None] * sigmas[:, None, :])
-    try:
-        np.linalg.cholesky(correlation + 1e-6 * np.eye(6))
-    except np.linalg.LinAlgError:
-        bad |= np.linalg.eigvalsh(correlation)[:, 0] < -1e-6
-    return bad
+    correlations = np.where(bad[:, None, None], np.eye(6), covariances) / (sigmas[:, :, None] * sigmas[:, None, :])
+    return bad | (np.linalg.eigvalsh(correlations)[:, 0] < -1e-6)
 
 
 def refuse_millimetres(path: object, T: RigidTransform, limit_m: float) -> None:
