@@ -1,0 +1,1 @@
+"""The commands of poet-loc; nobody imports them."""

@@ -92,7 +92,7 @@ def _unboxed(text: str) -> str:
     """Return the sentences inside tyro's box, without the frame and the pointer to the help."""
     sections: list[list[str]] = [[]]
     for line in text.splitlines():
-        if line.startswith("╭") or line.startswith("╰"):
+        if line.startswith(("╭", "╰")):
             continue
         words = line.strip("│ ")
         if words.startswith("──"):

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from typing import Protocol
+
+from poet_loc.report.tables import Table
 
 
 class Report(Protocol):
@@ -60,3 +62,15 @@ def progress(steps: int) -> Iterator[Report]:
     with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
         task = bar.add_task("", total=steps)
         yield _Bar(bar, task)
+
+
+def print_tables(tables: Iterable[Table]) -> None:
+    """Print tables that fit the terminal; into a pipe as markdown."""
+    if not sys.stdout.isatty():
+        print("\n".join(table.markdown() for table in tables), end="")
+        return
+    from rich.console import Console
+
+    console = Console()
+    for table in tables:
+        console.print(table.rich(console.width))

@@ -7,6 +7,7 @@ import subprocess
 import sys
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Annotated
 
 import tyro
 
@@ -17,7 +18,7 @@ from poet_loc.core.input_error import InputError
 class Arguments:
     """Open the recording of one run or several in rerun's viewer."""
 
-    runs: tyro.conf.Positional[tuple[Path, ...]]
+    runs: Annotated[tuple[Path, ...], tyro.conf.Positional, tyro.conf.arg(metavar="RUN")]
     """Run folders, or .rrd files."""
     web: bool = False
     """Serve the viewer to a browser on this machine (127.0.0.1 only) instead of opening a window."""
