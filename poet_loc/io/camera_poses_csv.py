@@ -31,9 +31,7 @@ def read_camera_poses(path: str | Path) -> CameraPoses:
     T_world_cam = poses_of(table)
     covariances = covariances_of(table)
     stamps = table["timestamp_ns"]
-    step = np.diff(stamps, prepend=stamps[0] - 1)
-    table.refuse(step < 0, "the stamp goes backwards", "sort the rows by time")
-    table.refuse(step == 0, "the stamp is there twice", "keep one row per frame")
+    table.refuse_disorder(stamps, "sort the rows by time, one per frame")
     return CameraPoses(stamps, table["frame"], T_world_cam, covariances)
 
 

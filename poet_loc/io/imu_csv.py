@@ -5,8 +5,6 @@ from __future__ import annotations
 import re
 from pathlib import Path
 
-import numpy as np
-
 from poet_loc.core.input_error import InputError
 from poet_loc.core.records import ImuSamples
 from poet_loc.io.number_table import read_number_csv, write_csv
@@ -34,9 +32,7 @@ def read_imu(path: str | Path) -> ImuSamples:
     table = read_number_csv(path, types, column_name=column_name)
     table.refuse_not_finite([*_GYROSCOPE, *_ACCELEROMETER])
     stamps = table["timestamp"]
-    step = np.diff(stamps, prepend=stamps[0] - 1)
-    table.refuse(step < 0, "the stamp goes backwards", "sort the rows by time")
-    table.refuse(step == 0, "the stamp is there twice", "keep one row per stamp")
+    table.refuse_disorder(stamps, "sort the rows by time, one per stamp")
     return ImuSamples(stamps, table.stack(_GYROSCOPE), table.stack(_ACCELEROMETER))
 
 

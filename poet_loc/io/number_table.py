@@ -57,6 +57,15 @@ class NumberTable:
         for name in names:
             self.refuse(~np.isfinite(self.columns[name]), f"column {name} is NaN or infinite", "leave such rows out")
 
+    def refuse_disorder(self, stamps: NDArray[np.int64], fix: str) -> None:
+        """Raise InputError for the first stamp that is not later than the one before."""
+        earlier, later = stamps[:-1], stamps[1:]
+        bad = np.concatenate([[False], later <= earlier])
+        if bad.any():
+            row = int(np.argmax(bad))
+            what = "the stamp is there twice" if stamps[row] == stamps[row - 1] else "the stamp goes backwards"
+            self.refuse(bad, what, fix)
+
 
 def read_number_csv(
     path: str | Path,
@@ -138,7 +147,7 @@ def _load(
                 skiprows=header_lines,
                 usecols=usecols,
                 ndmin=1,
-                encoding="utf-8",
+                encoding="utf-8-sig",
             )
     except (ValueError, OverflowError) as error:
         _explain(path, dtype, delimiter, header_lines, comments, usecols, cells_per_row, error)

@@ -47,7 +47,7 @@ def read_object_poses(path: str | Path) -> ObjectPoses:
         T_cam_obj,
         covariances,
     )
-    if np.all(np.diff(poses.stamps_ns) >= 0):
+    if np.all(poses.stamps_ns[1:] >= poses.stamps_ns[:-1]):
         return poses
     return poses[np.argsort(poses.stamps_ns, kind="stable")]
 
@@ -91,12 +91,11 @@ def _refuse_disorder(table: NumberTable) -> None:
     order = np.lexsort((instances, objects))  # stable: the file's order within one object
     earlier, later = order[:-1], order[1:]
     same = (objects[earlier] == objects[later]) & (instances[earlier] == instances[later])
-    step = stamps[later] - stamps[earlier]
-    bad = np.flatnonzero(same & (step <= 0))
+    bad = np.flatnonzero(same & (stamps[later] <= stamps[earlier]))
     if bad.size:
         first = bad[np.argmin(later[bad])]
         row = int(later[first])
         name = f"object {objects[row]}, instance {instances[row]}"
-        backwards = step[first] < 0
+        backwards = stamps[row] < stamps[earlier[first]]
         what = f"the stamps of {name} go backwards" if backwards else f"{name} is there twice at one stamp"
         table.refuse(np.arange(len(table)) == row, what, "sort the rows by time" if backwards else "keep one row")

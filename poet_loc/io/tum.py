@@ -28,9 +28,7 @@ def read_tum(path: str | Path) -> Trajectory:
     table = read_number_rows(path, [("t", "S64"), *((name, float) for name in POSE_COLUMNS)], comments="#")
     T_world_body = poses_of(table)
     stamps = _stamps_of(table)
-    step = np.diff(stamps, prepend=stamps[0] - 1)
-    table.refuse(step < 0, "the stamp goes backwards", "sort the rows by time")
-    table.refuse(step == 0, "the stamp is there twice", "keep one row per stamp, with enough decimals")
+    table.refuse_disorder(stamps, "sort the rows by time, one per stamp, with all decimals")
     return Trajectory(stamps, T_world_body)
 
 
