@@ -32,14 +32,15 @@ def _overlaps(a: Tensor, b: Tensor) -> tuple[Tensor, Tensor]:
     return shared / union, union
 
 
-def suppress(boxes: Tensor, scores: Tensor, threshold: float) -> Tensor:
-    """Return the indices of boxes (N, 4) that no better one overlaps by more than `threshold` IoU, best first."""
+def suppress(boxes: Tensor, scores: Tensor, threshold: float, at_most: int = 300) -> Tensor:
+    """Return the indices of at most `at_most` boxes (N, 4) that no better one overlaps by more than `threshold` IoU.
+
+    The best comes first; equal scores keep their order.
+    """
     order = torch.argsort(scores, descending=True, stable=True)
-    overlaps = (iou(boxes[order], boxes[order]) > threshold).triu(diagonal=1).cpu().numpy()
-    kept: list[int] = []
-    gone = torch.zeros(len(order), dtype=torch.bool).numpy()
-    for index in range(len(order)):
-        if not gone[index]:
-            kept.append(index)
-            gone |= overlaps[index]
-    return order[torch.tensor(kept, dtype=torch.int64, device=order.device)]
+    kept: list[Tensor] = []
+    while len(order) and len(kept) < at_most:
+        best, order = order[0], order[1:]
+        kept.append(best)
+        order = order[iou(boxes[best][None], boxes[order])[0] <= threshold]
+    return torch.stack(kept) if kept else order
