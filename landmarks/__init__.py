@@ -1,0 +1,1 @@
+"""Relative object poses and a map of landmarks become camera poses."""

@@ -1,0 +1,151 @@
+"""Camera poses that weigh all votes of a frame by their covariances, from every consensus that the frame offers.
+
+Minimised over T_world_cam: sum over detections of rho(e^T S^-1 e) with e = [Log(R_measured R_predicted^T),
+t_measured - t_predicted] in camera axes, S the detection's covariance, and rho of Geman and McClure with its scale at
+the gate. The detection's own frame keeps position and rotation apart, so the lever arm from the object to the camera
+needs no approximation.
+Sources: S. Geman, D. McClure, "Statistical methods for tomographic image reconstruction", Bull. ISI 52 (1987);
+iteratively reweighted Gauss-Newton as in Z. Zhang, "Parameter estimation techniques", IVC 15 (1997), section 9.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from landmarks.votes import Votes
+from poet_loc.core.geometry import skew
+
+Array = NDArray[np.float64]
+Indices = NDArray[np.intp]
+
+ACCEPTED_WEIGHT = 0.25
+"""The weight at the gate: a detection that weighs less is refused."""
+
+_WIDER_START = 4.0  # the first step's gate, in gates
+_MAX_STEPS = 30
+_CONVERGED = 1e-8
+_ROWS_AT_ONCE = 16384
+
+
+@dataclass(frozen=True)
+class Hypotheses:
+    """M camera poses, those of a frame next to each other, frames ascending."""
+
+    frame: Indices
+    """(M,)"""
+    R_world_cam: Array
+    t_world_cam: Array
+    weights: Array
+    """(M, K) of each vote, 1 where it fits perfectly, ACCEPTED_WEIGHT at the gate."""
+    covariances: Array
+    """(M, 6, 6) of [e_r, e_t] with R = R_true Exp(e_r), t = t_true + e_t."""
+
+    def __getitem__(self, index: Indices) -> Hypotheses:
+        return Hypotheses(*(getattr(self, each.name)[index] for each in fields(self)))
+
+
+def weighted_consensus(votes: Votes, covariances: Array, gate: float) -> Hypotheses:
+    """Return one refined pose per consensus: the distinct sets of detections within the gate of one of the votes.
+
+    covariances (F, K, 6, 6) of the detections; gate is a bound on the squared Mahalanobis distance (6 degrees).
+    """
+    information = np.where(votes.valid[..., None, None], np.linalg.inv(covariances), 0.0)
+    per_chunk = max(1, _ROWS_AT_ONCE // max(votes.valid.shape[1] ** 2, 1))
+    parts = []
+    for first in range(0, max(len(votes), 1), per_chunk):
+        chunk = slice(first, first + per_chunk)
+        frame, place = _starts(votes[chunk], information[chunk], gate)
+        parts.append(_refined(votes[chunk], information[chunk], frame, place, gate, first))
+    return Hypotheses(*(np.concatenate([getattr(part, each.name) for part in parts]) for each in fields(Hypotheses)))
+
+
+def residuals(votes: Votes, R_world_cam: Array, t_world_cam: Array) -> tuple[Array, Array]:
+    """Return [e_r, e_t] (M, K, 6) of the votes' rows at camera poses (M, 3, 3), (M, 3), and t_predicted (M, K, 3)."""
+    R_cam_world = np.swapaxes(R_world_cam, -1, -2)[:, None]
+    turned = votes.R_cam_obj @ np.swapaxes(R_cam_world @ votes.R_world_obj, -1, -2)
+    t_predicted = np.einsum("mij,mki->mkj", R_world_cam, votes.t_world_obj - t_world_cam[:, None])
+    return np.concatenate([_rotation_vector(turned), votes.t_cam_obj - t_predicted], axis=-1), t_predicted
+
+
+def _rotation_vector(rotations: Array) -> Array:
+    """Return Log of matrices (..., 3, 3); at a half turn, where every vote is refused, only its length is right."""
+    axis = 0.5 * np.stack(
+        [
+            rotations[..., 2, 1] - rotations[..., 1, 2],
+            rotations[..., 0, 2] - rotations[..., 2, 0],
+            rotations[..., 1, 0] - rotations[..., 0, 1],
+        ],
+        axis=-1,
+    )
+    sine = np.linalg.norm(axis, axis=-1)
+    angle = np.arctan2(sine, (np.trace(rotations, axis1=-2, axis2=-1) - 1.0) / 2.0)
+    small = sine < 1e-9
+    scaled = axis * np.where(small, 1.0, angle / np.where(small, 1.0, sine))[..., None]
+    scaled[small & (angle > 1.0)] = [np.pi, 0.0, 0.0]
+    return scaled
+
+
+def _starts(votes: Votes, information: Array, gate: float) -> tuple[Indices, Indices]:
+    """Return frame and place of one vote per distinct consensus: the one with the least total loss."""
+    frame, place = np.nonzero(votes.valid)
+    errors, _ = residuals(votes[frame], votes.R_world_cam[frame, place], votes.t_world_cam[frame, place])
+    square = np.sum(np.einsum("mki,mkij->mkj", errors, information[frame]) * errors, axis=-1)
+    consensus = np.packbits((square < _WIDER_START * gate) & votes.valid[frame], axis=1)
+    loss = np.sum(np.where(votes.valid[frame], square / (gate + square), 0.0), axis=1)
+    order = np.lexsort((place, np.round(loss, 9), *consensus.T[::-1], frame))
+    key = np.column_stack([frame, consensus])[order]
+    new = np.append(True, np.any(key[1:] != key[:-1], axis=1)) if len(order) else np.empty(0, bool)
+    chosen = np.sort(order[new])
+    return frame[chosen], place[chosen]
+
+
+def _refined(
+    votes: Votes, information: Array, frame: Indices, place: Indices, gate: float, first_frame: int
+) -> Hypotheses:
+    R, t = votes.R_world_cam[frame, place].copy(), votes.t_world_cam[frame, place].copy()
+    active = np.arange(len(frame))
+    for step in range(_MAX_STEPS):
+        if not active.size:
+            break
+        scale = gate * (_WIDER_START if step == 0 else 1.0)
+        rows, inverse = votes[frame[active]], information[frame[active]]
+        normal, gradient, _, _ = _normal_equations(rows, inverse, R[active], t[active], scale)
+        change = -np.linalg.solve(normal, gradient[..., None])[..., 0]
+        t[active] += np.einsum("mij,mj->mi", R[active], change[:, 3:])
+        R[active] = R[active] @ Rotation.from_rotvec(change[:, :3]).as_matrix()
+        moving = np.abs(change).max(axis=1) > _CONVERGED
+        active = active[moving | (step == 0)]
+    normal, _, weights, square = _normal_equations(votes[frame], information[frame], R, t, gate)
+    inside = weights > ACCEPTED_WEIGHT
+    freedom = 6.0 * np.maximum(inside.sum(axis=1) - 1, 1)
+    # votes that disagree more than their covariances allow are worth less (R. Birge, Phys. Rev. 40 (1932))
+    excess = np.maximum(1.0, np.sum(np.where(inside, weights * square, 0.0), axis=1) / freedom)
+    to_world = np.zeros_like(normal)
+    to_world[:, :3, :3], to_world[:, 3:, 3:] = np.eye(3), R
+    covariances = excess[:, None, None] * (to_world @ np.linalg.inv(normal) @ np.swapaxes(to_world, -1, -2))
+    covariances = (covariances + np.swapaxes(covariances, -1, -2)) / 2.0
+    return Hypotheses(frame + first_frame, R, t, weights, covariances)
+
+
+def _normal_equations(
+    votes: Votes, information: Array, R: Array, t: Array, gate: float
+) -> tuple[Array, Array, Array, Array]:
+    """Return J^T W J (M, 6, 6), J^T W e (M, 6), weights and squared distances (M, K), camera axes.
+
+    With T_world_cam changed to R Exp(a), t + R b: e_r + a and e_t - t_predicted x a + b to first order.
+    """
+    errors, t_predicted = residuals(votes, R, t)
+    weighted_errors = np.einsum("mkij,mkj->mki", information, errors)
+    square = np.sum(weighted_errors * errors, axis=-1)
+    weights = np.where(votes.valid, (gate / (gate + square)) ** 2, 0.0)
+    jacobian = np.zeros((*weights.shape, 6, 6))
+    jacobian[...] = np.eye(6)
+    jacobian[..., 3:, :3] = -skew(t_predicted)
+    transposed = np.swapaxes(jacobian, -1, -2)
+    normal = np.sum(weights[..., None, None] * (transposed @ information @ jacobian), axis=1)
+    gradient = np.sum(weights[..., None] * (transposed @ weighted_errors[..., None])[..., 0], axis=1)
+    return normal, gradient, weights, square
