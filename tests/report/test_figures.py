@@ -1,0 +1,142 @@
+"""Figures: what is drawn, in which unit, and that missing parts only leave out what they are needed for."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import replace
+from pathlib import Path
+
+import matplotlib as mpl
+import numpy as np
+import pytest
+from matplotlib.colors import to_rgb
+from matplotlib.figure import Figure
+from PIL import Image
+
+from poet_loc.core.input_error import InputError
+from poet_loc.report import figure_style
+from poet_loc.report.evaluate import ERROR_AXES
+from poet_loc.report.figures import draw_run, error_figure, write_figures
+from poet_loc.report.run_record import ACCEPTED, POSITION_ONLY, REFUSED, ROTATION_ONLY, RunRecord
+
+EXPECTED = {
+    "errors_localize_best",
+    "errors_localize_robust",
+    "errors_fuse_eskf_objects",
+    "error_distribution",
+    "consistency_localize_robust",
+    "consistency_fuse_eskf_objects",
+    "trajectory_cam",
+    "trajectory_imu",
+    "top_view",
+    "landmarks_localize_robust",
+    "landmarks_fuse_eskf_objects",
+}
+
+
+@pytest.fixture(scope="module")
+def figures(run_record: RunRecord) -> dict[str, Figure]:
+    return draw_run(run_record)
+
+
+def test_a_full_run_has_every_figure(figures: dict[str, Figure]) -> None:
+    assert set(figures) == EXPECTED
+
+
+def test_every_axis_has_a_unit(figures: dict[str, Figure]) -> None:
+    for name, figure in figures.items():
+        for axes in figure.axes:
+            texts = [axes.get_xlabel(), axes.get_ylabel()]
+            assert any(texts), name
+            for text in texts:
+                assert not text or re.search(r"\[.+\]$", text) or text == "share of the common frames", (name, text)
+        assert any(axes.get_xlabel() for axes in figure.axes), name
+
+
+def test_errors_are_drawn_in_mm_and_deg_with_three_sigma(run_record: RunRecord) -> None:
+    assert run_record.evaluation is not None
+    row = run_record.evaluation["fuse/eskf/objects"]
+    figure = error_figure(row, run_record.start_ns)
+    panels = {axes.get_ylabel(): axes for axes in figure.axes}
+    for k, unit, factor in ((2, "mm", 1e3), (3, "deg", 180 / np.pi)):
+        axes = panels[f"{ERROR_AXES[k]} [{unit}]"]
+        seconds, error = axes.lines[0].get_data()
+        np.testing.assert_allclose(error, row.errors[:, k] * factor)
+        np.testing.assert_allclose(seconds, (row.stamps_ns - run_record.start_ns) * 1e-9)
+        band = axes.collections[0].get_paths()[0].vertices[:, 1]
+        assert row.sigmas is not None
+        assert band.max() == pytest.approx(3 * row.sigmas[0, k] * factor)
+
+
+def test_gross_errors_do_not_shrink_the_rest(run_record: RunRecord) -> None:
+    assert run_record.evaluation is not None
+    row = run_record.evaluation["localize/robust"]
+    errors = row.errors.copy()
+    errors[3, 0] = 50.0
+    axes = error_figure(replace(row, errors=errors)).axes[0]
+    assert axes.get_ylim()[1] < 200.0
+    assert "1 frames beyond, up to 5e+04" in axes.get_title("right")
+
+
+def test_lines_do_not_bridge_gaps() -> None:
+    seconds = np.array([0.0, 0.1, 0.2, 0.9, 1.0])
+    at, values = figure_style.broken(seconds, np.arange(5.0))
+    assert np.isnan(at).tolist() == [False, False, False, True, False, False]
+    assert np.isnan(values[3])
+    assert figure_style.broken(seconds[:1], seconds[:1])[0].tolist() == [0.0]
+
+
+def test_decisions_of_gate_and_votes(run_record: RunRecord) -> None:
+    gate = run_record.fused[0].gate
+    assert gate is not None
+    found = run_record.decisions["fuse/eskf/objects"].decisions
+    both = gate.position_accepted & gate.rotation_accepted
+    neither = ~gate.position_accepted & ~gate.rotation_accepted
+    assert (found[both] == ACCEPTED).all()
+    assert (found[neither] == REFUSED).all()
+    assert (found[gate.position_accepted & ~both] == POSITION_ONLY).all()
+    assert (found[gate.rotation_accepted & ~both] == ROTATION_ONLY).all()
+    lanes = run_record.decisions["localize/robust"].lanes()
+    assert list(lanes) == [(3, 0), (9, 1)]
+    assert sum(len(stamps) for stamps, _ in lanes.values()) == 240
+    assert [run_record.landmark_label(*key) for key in lanes] == ["004_sugar_box", "object 9 #1"]
+
+
+def test_lanes_cover_the_time_that_was_seen(figures: dict[str, Figure]) -> None:
+    """The bars of a lane add up to the frames in which the landmark was seen."""
+    bars = [path for c in figures["landmarks_localize_robust"].axes[0].collections for path in c.get_paths()]
+    widths = [np.ptp(path.vertices[:, 0]) for path in bars]
+    assert sum(widths) == pytest.approx(2 * 4.0, rel=1e-3)
+
+
+def test_what_is_missing_leaves_out_only_its_figures(run_record: RunRecord) -> None:
+    bare = replace(run_record, references={}, evaluation=None, fused=(), landmark_map=None, detections=None, voted={})
+    assert set(draw_run(bare)) == {"trajectory_cam", "trajectory_imu", "top_view"}
+    silent = replace(run_record.estimates[1], trajectory=run_record.estimates[1].trajectory[:0])
+    assert set(draw_run(replace(bare, estimates=(silent,)))) == {"trajectory_cam", "top_view"}
+    assert draw_run(replace(bare, estimates=())) == {}
+
+
+def test_files_are_written_with_something_in_them(run_record: RunRecord, tmp_path: Path) -> None:
+    before = dict(mpl.rcParams)
+    few = replace(run_record, evaluation=None, detections=None, voted={}, fused=())
+    paths = write_figures(few, tmp_path / "figures")
+    assert {path.name for path in paths} == {"trajectory_cam.png", "trajectory_imu.png", "top_view.png"}
+    for path in paths:
+        with Image.open(path) as image:
+            assert image.width == int(figure_style.WIDTH * 160)
+            assert np.std(np.asarray(image.convert("L"))) > 5
+    (pdf,) = figure_style.save_figures({"top_view": draw_run(few)["top_view"]}, tmp_path, "pdf")
+    assert pdf.read_bytes().startswith(b"%PDF")
+    assert dict(mpl.rcParams) == before
+    with pytest.raises(InputError, match="'bmp'"):
+        figure_style.save_figures({}, tmp_path, "bmp")
+
+
+def test_colours_are_told_apart_by_the_colour_blind() -> None:
+    """Under a simulation of deuteranopia (Vienot et al. 1999) the palette keeps its distances."""
+    palette = [figure_style.BLUE, figure_style.VERMILLION, figure_style.GREEN, figure_style.PURPLE]
+    simulation = np.array([[0.29275, 0.70725, 0.0], [0.29275, 0.70725, 0.0], [-0.02234, 0.02234, 1.0]])
+    seen = np.array([to_rgb(colour) for colour in palette]) ** 2.2 @ simulation.T
+    gaps = np.linalg.norm(seen[:, None] - seen, axis=-1) + np.eye(len(palette))
+    assert gaps.min() > 0.1
