@@ -1,0 +1,1 @@
+"""Camera or object poses and an IMU become a trajectory."""

@@ -1,0 +1,462 @@
+"""The filter in time: integrate up to a stamp, take in what was measured there, start, and start again.
+
+The whole-log call below and the online estimator (`fusion/online.py`) go through the same functions.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numba import njit
+
+from fusion.consensus import (
+    LONGEST_WINDOW_S,
+    LOST_MIN_VOTES,
+    LOST_SHARE,
+    LOST_WINDOW_S,
+    MIN_VOTES,
+    START_MIN_SPAN_S,
+    START_WINDOW_S,
+    VOTE_DISTANCE,
+    VOTE_USED,
+    largest_agreement,
+)
+from fusion.eskf import (
+    ACCEPTED,
+    POSITION_ONLY,
+    REJECTED,
+    bias_sigma,
+    correct,
+    decay_biases,
+    fit_symmetry,
+    gate,
+    innovation,
+)
+from fusion.imu import propagate_covariance, propagate_nominal, transition_blocks, write_gravity_basis
+from fusion.measurements import OBJECT_POSE, camera_in_world, residual_and_jacobian
+from fusion.memory import (
+    BIAS_TIME,
+    IMU_AT,
+    INITIALISING,
+    LAST_UPDATE,
+    MODE,
+    NOW,
+    RESTARTS,
+    STARTED_AT,
+    TRACKING,
+    UP_COUNT,
+    VOTE_HEAD,
+    Memory,
+    Work,
+    views,
+    work_views,
+)
+from fusion.nav_state import (
+    AT_BIASES,
+    AT_GRAVITY,
+    BIASES,
+    EXTRINSIC_POSITION,
+    EXTRINSIC_ROTATION,
+    GRAVITY,
+    GYRO_BIAS,
+    GYRO_BIAS_ERROR,
+    N_BIAS_KINDS,
+    N_ERROR,
+    N_OBJECTS,
+    OBJECT_SIZE,
+    OBJECTS,
+    POSITION,
+    TIME_OFFSET,
+    VELOCITY,
+    Array,
+    Ints,
+)
+from fusion.so3_kernels import (
+    apply,
+    multiply,
+    multiply_transposed_left,
+    multiply_transposed_right,
+)
+
+# Places in the limits.
+LIMIT_BOTH, LIMIT_ROTATION, LIMIT_POSITION, PARTIAL, NOMINAL_OFFSET, ADAPTATION, MAX_SCALE = range(7)
+
+OUT_CORE, OUT_SIGMA, OUT_COVARIANCE = 21, 15, 36
+
+
+@njit(cache=True)
+def begin(m: Memory, stamp: int, specific_force: Array, imu_index: int) -> None:
+    """Begin to integrate: level attitude from the first specific force, heading, position and velocity zero."""
+    ax, ay, az = specific_force[0], specific_force[1], specific_force[2]
+    norm = math.sqrt(ax * ax + ay * ay + az * az)
+    ux, uy, uz = (ax / norm, ay / norm, az / norm) if norm > 0.0 else (0.0, 0.0, 1.0)
+    # Rows of R_world_imu: any x axis across up, then y, then up in imu axes.
+    hx, hy, hz = (0.0, uz, -uy) if abs(ux) > 0.9 else (1.0 - ux * ux, -ux * uy, -ux * uz)
+    scale = math.sqrt(hx * hx + hy * hy + hz * hz)
+    hx, hy, hz = hx / scale, hy / scale, hz / scale
+    rows = (hx, hy, hz, uy * hz - uz * hy, uz * hx - ux * hz, ux * hy - uy * hx, ux, uy, uz)
+    for i in range(9):
+        m.x[i] = rows[i]
+    for i in range(6):
+        m.x[POSITION + i] = 0.0
+    m.up[0], m.up[1], m.up[2] = 0.0, 0.0, 1.0
+    c = m.counters
+    c[NOW], c[IMU_AT], c[MODE], c[BIAS_TIME], c[UP_COUNT] = stamp, imu_index, INITIALISING, stamp, 0
+
+
+@njit(cache=True)
+def advance(m: Memory, w: Work, imu_stamps: Ints, imu_values: Array, until: int) -> None:
+    """Integrate the IMU from where the filter is up to a stamp, which the samples must reach.
+
+    Between two samples both signals are linear in time: the mean over a part of an interval is the value at its middle.
+    """
+    c = m.counters
+    rate, force = w.scratch[0:3], w.scratch[3:6]
+    while c[NOW] < until:
+        k = c[IMU_AT]
+        start, end = imu_stamps[k], imu_stamps[k + 1]
+        stop = min(end, until)
+        share = 0.5 * ((c[NOW] - start) + (stop - start)) / (end - start)
+        for i in range(3):
+            rate[i] = imu_values[k, i] + share * (imu_values[k + 1, i] - imu_values[k, i])
+            force[i] = imu_values[k, 3 + i] + share * (imu_values[k + 1, 3 + i] - imu_values[k, 3 + i])
+        dt = (stop - c[NOW]) * 1e-9
+        if c[MODE] == TRACKING:
+            if m.layout[AT_GRAVITY] >= 0:
+                write_gravity_basis(m.x, w.basis)
+            propagate_nominal(m.x, dt, rate, force, w.step)
+            transition_blocks(dt, w.step, w.blocks)
+            propagate_covariance(m.P, w.blocks, dt, m.noise, w.basis, m.layout, w.core, w.rows)
+        else:
+            propagate_nominal(m.x, dt, rate, force, w.step)
+            _watch_gravity(m, w, dt)
+        c[NOW] = stop
+        if stop == end:
+            c[IMU_AT] = k + 1
+
+
+@njit(cache=True)
+def _watch_gravity(m: Memory, w: Work, dt: float) -> None:
+    """Average the specific force in the integrated motion's axes over about the start's window: it points up."""
+    m.counters[UP_COUNT] += 1
+    gain = max(1.0 / m.counters[UP_COUNT], min(1.0, dt / m.start[START_WINDOW_S]))
+    for i in range(3):
+        upward = w.step[24 + i] - m.x[GRAVITY + i]
+        m.up[i] += gain * (upward - m.up[i])
+
+
+@njit(cache=True)
+def angular_velocity_at(m: Memory, imu_stamps: Ints, imu_values: Array, out: Array) -> None:
+    """Write the unbiased angular velocity at the filter's stamp."""
+    k = m.counters[IMU_AT]
+    share = 0.0
+    following = k
+    if m.counters[NOW] > imu_stamps[k]:
+        following = k + 1
+        share = (m.counters[NOW] - imu_stamps[k]) / (imu_stamps[following] - imu_stamps[k])
+    for i in range(3):
+        value = imu_values[k, i] + share * (imu_values[following, i] - imu_values[k, i])
+        out[i] = value - m.x[GYRO_BIAS + i]
+
+
+@njit(cache=True)
+def measure(
+    m: Memory,
+    w: Work,
+    first: int,
+    last: int,
+    kinds: Ints,
+    objects: Ints,
+    rotations: Array,
+    translations: Array,
+    covariances: Array,
+    rate: Array,
+    decisions: Ints,
+    nis: Array,
+) -> None:
+    """Take in the measurements first..last-1, all at the filter's stamp; write decisions (M,) and nis (M, 3)."""
+    c = m.counters
+    if c[MODE] == TRACKING:
+        decay_biases(m.x, m.P, (c[NOW] - c[BIAS_TIME]) * 1e-9, m.bias_model, m.layout)
+        c[BIAS_TIME] = c[NOW]
+    accepted = False
+    for j in range(first, last):
+        decisions[j] = REJECTED
+    for again in range(2 if c[MODE] == TRACKING else 0):  # what was refused before the others moved the state, again
+        for j in range(first, last if accepted or again == 0 else first):
+            if decisions[j] == REJECTED:
+                k, R_m, t_m = objects[j], rotations[j], translations[j]
+                decisions[j] = _update(m, w, kinds[j], k, R_m, t_m, covariances[j], rate, nis[j])
+                accepted = accepted or decisions[j] != REJECTED
+    for j in range(first, last):
+        _vote(m, w, kinds[j], objects[j], rotations[j], translations[j], decisions[j])
+    if accepted:
+        c[LAST_UPDATE] = c[NOW]
+    if c[MODE] == INITIALISING:
+        _try_to_start(m, w)
+    else:
+        _restart_if_lost(m, w)
+
+
+@njit(cache=True)
+def _update(
+    m: Memory,
+    w: Work,
+    kind: int,
+    k: int,
+    rotation: Array,
+    translation: Array,
+    covariance: Array,
+    rate: Array,
+    nis: Array,
+) -> int:
+    n = m.layout[N_ERROR]
+    R_m, t_m = w.measured[0:9], w.measured[9:12]
+    for i in range(9):
+        R_m[i] = rotation[i]
+    for i in range(3):
+        t_m[i] = translation[i]
+    scale = m.scales[k] if kind == OBJECT_POSE else 1.0
+    for i in range(6):
+        for j in range(6):
+            w.R[i, j] = covariance[i, j] * scale
+    if kind == OBJECT_POSE and m.orders[k] != 1:
+        _fit_object_symmetry(m, w, k, R_m, rate)
+    count = residual_and_jacobian(
+        kind, k, R_m, t_m, m.x, rate, m.limits[NOMINAL_OFFSET], m.layout, w.residual, w.H, m.columns, w.step
+    )
+    innovation(m.P, w.H, m.columns, count, w.R, n, w.PHt, w.S)
+    decision = gate(w.S, w.residual, m.limits, m.limits[PARTIAL] > 0.0, w.L, w.white, nis)
+    if kind == OBJECT_POSE and m.limits[ADAPTATION] > 0.0:
+        _adapt_scale(m, k, nis[0])
+    if decision == ACCEPTED:
+        correct(m.x, m.P, w.PHt, w.S, w.residual, 0, 6, m.layout, w.L, w.white, w.Z, w.error, w.scratch)
+    elif decision != REJECTED:
+        start = 3 if decision == POSITION_ONLY else 0
+        correct(m.x, m.P, w.PHt, w.S, w.residual, start, 3, m.layout, w.L, w.white, w.Z, w.error, w.scratch)
+    return decision
+
+
+@njit(cache=True)
+def _adapt_scale(m: Memory, k: int, nis: float) -> None:
+    """Follow how large an object's innovations are against their stated size, gross errors capped."""
+    ratio = min(nis / 6.0, 4.0)
+    scale = m.scales[k] * math.exp(m.limits[ADAPTATION] * (ratio - 1.0))
+    m.scales[k] = min(max(scale, 1.0), m.limits[MAX_SCALE])
+
+
+@njit(cache=True)
+def _fit_object_symmetry(m: Memory, w: Work, k: int, R_m: Array, rate: Array) -> None:
+    R_wi, R_wc, p_wi, R_co = w.step[0:9], w.step[9:18], w.step[18:21], w.step[30:39]
+    camera_in_world(m.x, m.x[TIME_OFFSET] - m.limits[NOMINAL_OFFSET], rate, R_wi, p_wi, R_wc, w.step[21:30])
+    at = OBJECTS + OBJECT_SIZE * k
+    multiply_transposed_left(R_wc, m.x[at : at + 9], R_co)
+    fit_symmetry(R_m, R_co, m.axes[k], m.orders[k], w.R, w.scratch)
+
+
+@njit(cache=True)
+def _vote(m: Memory, w: Work, kind: int, k: int, rotation: Array, translation: Array, decision: int) -> None:
+    """Remember where a measurement puts the imu. A symmetric object does not say which way it is turned: no vote."""
+    if kind == OBJECT_POSE and m.orders[k] != 1:
+        return
+    slot = m.counters[VOTE_HEAD] % len(m.vote_stamps)
+    vote = m.votes[slot]
+    R_wc, R_wi, lever, p_wc = w.step[0:9], vote[0:9], w.step[9:12], w.step[12:15]
+    if kind == OBJECT_POSE:
+        at = OBJECTS + OBJECT_SIZE * k
+        multiply_transposed_right(m.x[at : at + 9], rotation, R_wc)
+        apply(R_wc, translation[0], translation[1], translation[2], lever)
+        for i in range(3):
+            p_wc[i] = m.x[at + 9 + i] - lever[i]
+        distance = math.sqrt(translation[0] ** 2 + translation[1] ** 2 + translation[2] ** 2)
+    else:
+        for i in range(9):
+            R_wc[i] = rotation[i]
+        for i in range(3):
+            p_wc[i] = translation[i]
+        distance = 1.0
+    multiply_transposed_right(R_wc, m.x[EXTRINSIC_ROTATION : EXTRINSIC_ROTATION + 9], R_wi)
+    p_ic = m.x[EXTRINSIC_POSITION : EXTRINSIC_POSITION + 3]
+    apply(R_wi, p_ic[0], p_ic[1], p_ic[2], lever)
+    for i in range(3):
+        vote[9 + i] = p_wc[i] - lever[i]
+        vote[21 + i] = m.x[POSITION + i]
+    for i in range(9):
+        vote[12 + i] = m.x[i]
+    vote[VOTE_USED] = decision & POSITION_ONLY  # rotation alone does not hold the position
+    vote[VOTE_DISTANCE] = distance
+    m.vote_stamps[slot] = m.counters[NOW]
+    m.counters[VOTE_HEAD] += 1
+
+
+@njit(cache=True)
+def _first_vote(m: Memory, window_s: float, wanted: int) -> int:
+    """Return where the votes of the window start; a window with fewer than wanted votes reaches further back."""
+    head, capacity = m.counters[VOTE_HEAD], len(m.vote_stamps)
+    first = head
+    while first > 0 and head - first < capacity - 1:
+        age = (m.counters[NOW] - m.vote_stamps[(first - 1) % capacity]) * 1e-9
+        if age > m.start[LONGEST_WINDOW_S] or (age > window_s and head - first >= wanted):
+            break
+        first -= 1
+    return first
+
+
+@njit(cache=True)
+def _agreement(m: Memory, w: Work, first: int) -> tuple[int, float]:
+    """Return how many of the votes since `first` agree and their span; leave their correction in w.step[96:117].
+
+    The integrated velocity may be right (the votes jump) or wrong (there were none for long), so both are tried.
+    """
+    kept = _agreement_beside(m, w, first, 0.0)
+    replaced = _agreement_beside(m, w, first, 1.0)
+    return _agreement_beside(m, w, first, 0.0) if kept[0] >= replaced[0] else replaced
+
+
+@njit(cache=True)
+def _agreement_beside(m: Memory, w: Work, first: int, share_of_velocity: float) -> tuple[int, float]:
+    C, d, v, origin = w.step[96:105], w.step[105:108], w.step[108:111], w.step[111:117]
+    for i in range(3):
+        origin[i] = m.x[POSITION + i]
+        origin[3 + i] = share_of_velocity * m.x[VELOCITY + i]
+    return largest_agreement(
+        m.votes,
+        m.vote_stamps,
+        first,
+        m.counters[VOTE_HEAD],
+        m.counters[NOW],
+        m.up,
+        origin,
+        m.x[GRAVITY : GRAVITY + 3],
+        m.start,
+        C,
+        d,
+        v,
+        m.inliers,
+        w.step,
+    )
+
+
+@njit(cache=True)
+def _try_to_start(m: Memory, w: Work) -> None:
+    first = _first_vote(m, m.start[START_WINDOW_S], 2 * int(m.start[MIN_VOTES]))
+    count, span = _agreement(m, w, first)
+    if count < m.start[MIN_VOTES] or span < m.start[START_MIN_SPAN_S]:
+        return
+    _adopt(m, w, 0)
+    m.counters[MODE], m.counters[STARTED_AT] = TRACKING, m.counters[NOW]
+
+
+@njit(cache=True)
+def _restart_if_lost(m: Memory, w: Work) -> None:
+    """Start again where hardly anything of late was accepted and what was refused agrees with itself."""
+    first, head = _first_vote(m, m.start[LOST_WINDOW_S], int(m.start[LOST_MIN_VOTES])), m.counters[VOTE_HEAD]
+    if head - first < m.start[LOST_MIN_VOTES]:
+        return
+    used = 0.0
+    for a in range(first, head):
+        used += m.votes[a % len(m.vote_stamps), VOTE_USED]
+    if used > m.start[LOST_SHARE] * (head - first):
+        return
+    m.up[0], m.up[1], m.up[2] = 0.0, 0.0, 1.0
+    count, _ = _agreement(m, w, first)
+    if count > m.start[LOST_MIN_VOTES] and count > 3.0 * used:
+        _adopt(m, w, GYRO_BIAS_ERROR)
+        m.counters[RESTARTS] += 1
+
+
+@njit(cache=True)
+def _adopt(m: Memory, w: Work, keep_from: int) -> None:
+    """Move the state to the agreed pose; error states before keep_from (all where 0) and object biases start anew."""
+    C, d, v, origin, turned = w.step[96:105], w.step[105:108], w.step[108:111], w.step[111:117], w.step[0:9]
+    multiply(C, m.x[0:9], turned)
+    for i in range(9):
+        m.x[i] = turned[i]
+    kept = w.step[9:12]
+    apply(C, m.x[VELOCITY] - origin[3], m.x[VELOCITY + 1] - origin[4], m.x[VELOCITY + 2] - origin[5], kept)
+    for i in range(3):
+        m.x[POSITION + i] = d[i]
+        m.x[VELOCITY + i] = kept[i] + v[i]
+    n = m.layout[N_ERROR]
+    at = m.layout[AT_BIASES]
+    biases = 6 * m.layout[N_OBJECTS] * m.layout[N_BIAS_KINDS]
+    for i in range(n):
+        if i >= keep_from and keep_from > 0 and not (at >= 0 and at <= i < at + biases):
+            continue
+        for j in range(n):
+            m.P[i, j] = m.P[j, i] = 0.0
+        m.P[i, i] = m.prior[i] ** 2
+    for i in range(biases):
+        kind, component = i // (6 * m.layout[N_OBJECTS]), i % 6
+        m.x[m.layout[BIASES] + i] = 0.0
+        m.P[at + i, at + i] = bias_sigma(m.bias_model, kind, component) ** 2
+    m.counters[BIAS_TIME] = m.counters[NOW]
+    # The agreeing votes count as used, so that a restart is not followed by the next at once.
+    for a in range(len(m.inliers)):
+        if m.inliers[a]:
+            m.votes[a, VOTE_USED] = 1.0
+
+
+@njit(cache=True)
+def emit(m: Memory, row: int, out_stamps: Ints, out_core: Array, out_sigma: Array, out_covariance: Array) -> None:
+    """Write the state of now: core (21,), 1-sigma of its errors (15,), covariance of attitude and position (36,)."""
+    out_stamps[row] = m.counters[NOW]
+    for i in range(OUT_CORE):
+        out_core[row, i] = m.x[i]
+    for i in range(OUT_SIGMA):
+        out_sigma[row, i] = math.sqrt(max(m.P[i, i], 0.0))
+    for i in range(6):
+        for j in range(6):
+            out_covariance[row, 6 * i + j] = m.P[i, j]
+
+
+@njit(cache=True)
+def run_log(
+    floats: Array,
+    integers: Ints,
+    imu_stamps: Ints,
+    imu_values: Array,
+    stamps: Ints,
+    kinds: Ints,
+    objects: Ints,
+    rotations: Array,
+    translations: Array,
+    covariances: Array,
+    decisions: Ints,
+    nis: Array,
+    out_stamps: Ints,
+    out_core: Array,
+    out_sigma: Array,
+    out_covariance: Array,
+) -> int:
+    """Filter a whole log in one call; return how many rows were written.
+
+    A row for every IMU sample and every stamp with measurements, from the start on, each with what was known then.
+    """
+    m = views(floats, integers)
+    w = work_views(m.work, m.layout[N_ERROR])
+    rate = np.zeros(3)
+    rows, j, total = 0, 0, len(stamps)
+    while j < total and stamps[j] < imu_stamps[0]:
+        j += 1
+    begin(m, imu_stamps[0], imu_values[0, 3:6], 0)
+    for k in range(len(imu_stamps)):
+        emitted = False
+        while j < total and stamps[j] <= imu_stamps[k]:
+            last = j
+            while last < total and stamps[last] == stamps[j]:
+                last += 1
+            advance(m, w, imu_stamps, imu_values, stamps[j])
+            angular_velocity_at(m, imu_stamps, imu_values, rate)
+            measure(m, w, j, last, kinds, objects, rotations, translations, covariances, rate, decisions, nis)
+            j = last
+            if m.counters[MODE] == TRACKING:
+                emit(m, rows, out_stamps, out_core, out_sigma, out_covariance)
+                rows += 1
+                emitted = m.counters[NOW] == imu_stamps[k]
+        advance(m, w, imu_stamps, imu_values, imu_stamps[k])
+        if m.counters[MODE] == TRACKING and not emitted:
+            emit(m, rows, out_stamps, out_core, out_sigma, out_covariance)
+            rows += 1
+    return rows

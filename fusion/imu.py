@@ -1,0 +1,190 @@
+"""Strapdown propagation of state and covariance between two IMU samples.
+
+Midpoint integration: the angular velocity and specific force of an interval are the means of its two ends, and
+the specific force is turned by the attitude of the interval's middle (holding the attitude of its start leaves
+an error of 1e-2 m/s^2 on hand-held motion).
+Source: J. Sola, "Quaternion kinematics for the error-state Kalman filter", arXiv:1711.02508 (S), section 5.4,
+with the midpoint attitude in place of the start's and the bias terms kept to second order in dt.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+
+from fusion.nav_state import (
+    ACCEL_BIAS,
+    ACCEL_BIAS_ERROR,
+    AT_GRAVITY,
+    CORE,
+    GRAVITY,
+    GYRO_BIAS,
+    GYRO_BIAS_ERROR,
+    N_ERROR,
+    POSITION,
+    POSITION_ERROR,
+    VELOCITY,
+    VELOCITY_ERROR,
+    Array,
+    Ints,
+)
+from fusion.so3_kernels import apply, exp_so3, left_jacobian, multiply, orthonormalise, times_skew
+
+# Places in the noise array (densities in Kalibr's units, then the uncertainty of a bridged gap).
+GYRO_NOISE, ACCEL_NOISE, GYRO_WALK, ACCEL_WALK, GAP_S, GAP_RATE, GAP_ACCEL = range(7)
+
+
+@njit(cache=True)
+def propagate_nominal(x: Array, dt: float, angular_velocity: Array, specific_force: Array, work: Array) -> None:
+    """Move the nominal state by dt seconds, in place; S eq. 260 with the midpoint attitude.
+
+    angular_velocity (3,) rad/s and specific_force (3,) m/s^2 are means over the interval with their biases still on.
+    Leaves in work: Exp(w dt) at 0, R_mid at 9, unbiased w at 18 and a at 21, world acceleration at 24.
+    """
+    turn, half, R_mid, accel = work[0:9], work[27:36], work[9:18], work[24:27]
+    for i in range(3):
+        work[18 + i] = angular_velocity[i] - x[GYRO_BIAS + i]
+        work[21 + i] = specific_force[i] - x[ACCEL_BIAS + i]
+    wx, wy, wz = work[18] * dt, work[19] * dt, work[20] * dt
+    exp_so3(wx, wy, wz, turn)
+    exp_so3(0.5 * wx, 0.5 * wy, 0.5 * wz, half)
+    multiply(x, half, R_mid)
+    apply(R_mid, work[21], work[22], work[23], accel)
+    for i in range(3):
+        accel[i] += x[GRAVITY + i]
+        x[POSITION + i] += dt * x[VELOCITY + i] + 0.5 * dt * dt * accel[i]
+        x[VELOCITY + i] += dt * accel[i]
+    multiply(x, turn, half)
+    for i in range(9):
+        x[i] = half[i]
+    orthonormalise(x, half)
+
+
+@njit(cache=True)
+def transition_blocks(dt: float, work: Array, blocks: Array) -> None:
+    """Write the blocks of the core's transition matrix that are not identity, from what propagate_nominal left.
+
+    blocks of 9: theta<-theta, theta<-gyro bias, velocity<-theta, velocity<-gyro bias, velocity<-accel bias.
+    Position rows follow: position<-y = dt/2 * (velocity<-y), plus dt * velocity.  S eq. 270 with midpoint terms.
+    """
+    turn, R_mid, scratch, jacobian = work[0:9], work[9:18], work[27:36], work[36:45]
+    wx, wy, wz = work[18] * dt, work[19] * dt, work[20] * dt
+    ax, ay, az = work[21], work[22], work[23]
+    left_jacobian(wx, wy, wz, -1.0, jacobian)
+    for i in range(3):
+        for j in range(3):
+            blocks[3 * i + j] = turn[3 * j + i]
+            blocks[9 + 3 * i + j] = -dt * jacobian[3 * i + j]
+    # The start attitude's error turned to the middle: R Exp(theta) Exp(h) a = R_mid Exp(Exp(-h) theta) a.
+    exp_so3(-0.5 * wx, -0.5 * wy, -0.5 * wz, jacobian)
+    times_skew(R_mid, ax, ay, az, scratch)
+    multiply(scratch, jacobian, blocks[18:27])
+    left_jacobian(0.5 * wx, 0.5 * wy, 0.5 * wz, -1.0, jacobian)
+    multiply(scratch, jacobian, blocks[27:36])
+    for i in range(9):
+        blocks[18 + i] *= -dt
+        blocks[27 + i] *= 0.5 * dt * dt
+        blocks[36 + i] = -dt * R_mid[i]
+
+
+@njit(cache=True)
+def _rows_times(
+    blocks: Array, dt: float, gravity_basis: Array, at_gravity: int, P: Array, columns: int, scratch: Array
+) -> None:
+    """P[:15, :columns] <- F P[:15, :columns] for the core's transition F, in place (and gravity's two columns of F)."""
+    rate = scratch
+    for i in range(3):
+        for j in range(columns):
+            rate[i, j] = 0.0
+        for k in range(3):
+            c, d, e = blocks[18 + 3 * i + k], blocks[27 + 3 * i + k], blocks[36 + 3 * i + k]
+            for j in range(columns):
+                rate[i, j] += c * P[k, j] + d * P[GYRO_BIAS_ERROR + k, j] + e * P[ACCEL_BIAS_ERROR + k, j]
+        if at_gravity >= 0:
+            first, second = dt * gravity_basis[2 * i], dt * gravity_basis[2 * i + 1]
+            for j in range(columns):
+                rate[i, j] += first * P[at_gravity, j] + second * P[at_gravity + 1, j]
+    for i in range(3):
+        for j in range(columns):
+            P[POSITION_ERROR + i, j] += dt * P[VELOCITY_ERROR + i, j] + 0.5 * dt * rate[i, j]
+            P[VELOCITY_ERROR + i, j] += rate[i, j]
+            rate[i, j] = 0.0
+        for k in range(3):
+            a, b = blocks[3 * i + k], blocks[9 + 3 * i + k]
+            for j in range(columns):
+                rate[i, j] += a * P[k, j] + b * P[GYRO_BIAS_ERROR + k, j]
+    for i in range(3):
+        for j in range(columns):
+            P[i, j] = rate[i, j]
+
+
+@njit(cache=True)
+def propagate_covariance(
+    P: Array, blocks: Array, dt: float, noise: Array, gravity_basis: Array, layout: Ints, core: Array, scratch: Array
+) -> None:
+    """P <- F P F^T + Q, in place, touching the core block and its cross terms only.
+
+    P (n, n) symmetric; core (15 + 2, 15) and scratch (3, n) are work space. Everything outside the core is static here
+    (bias states decay at updates only), so the cost grows with n and not with its square.
+    """
+    n, at_gravity = layout[N_ERROR], layout[AT_GRAVITY]
+    _rows_times(blocks, dt, gravity_basis, at_gravity, P, n, scratch)
+    # F (P F^T): the core's columns are the transpose of the rows just made; gravity rows enter through theirs.
+    for i in range(CORE):
+        for j in range(CORE):
+            core[j, i] = P[i, j]
+    if at_gravity >= 0:
+        for i in range(CORE):
+            core[CORE, i] = P[i, at_gravity]
+            core[CORE + 1, i] = P[i, at_gravity + 1]
+        _rows_times(blocks, dt, gravity_basis, CORE, core, CORE, scratch)
+    else:
+        _rows_times(blocks, dt, gravity_basis, -1, core, CORE, scratch)
+    for i in range(CORE):
+        for j in range(i, CORE):
+            P[i, j] = P[j, i] = 0.5 * (core[i, j] + core[j, i])
+        for j in range(CORE, n):
+            P[j, i] = P[i, j]
+    add_process_noise(P, dt, noise)
+
+
+@njit(cache=True)
+def add_process_noise(P: Array, dt: float, noise: Array) -> None:
+    """Add what white noise and random walks do in dt seconds (S eq. 261, position integrated exactly).
+
+    An interval longer than noise[GAP_S] is a gap: angular rate and acceleration may have been anything of the given
+    size all through it, so their effects grow with dt and dt^2 instead of sqrt(dt).
+    """
+    gyro, accel = noise[GYRO_NOISE] ** 2, noise[ACCEL_NOISE] ** 2
+    attitude, velocity = gyro * dt, accel * dt
+    cross, position = 0.5 * accel * dt * dt, accel * dt**3 / 3.0
+    if dt > noise[GAP_S]:
+        attitude += (noise[GAP_RATE] * dt) ** 2
+        push = (noise[GAP_ACCEL] * dt) ** 2
+        velocity += push
+        cross += 0.5 * dt * push
+        position += 0.25 * dt * dt * push
+    for i in range(3):
+        P[i, i] += attitude
+        P[POSITION_ERROR + i, POSITION_ERROR + i] += position
+        P[VELOCITY_ERROR + i, VELOCITY_ERROR + i] += velocity
+        P[POSITION_ERROR + i, VELOCITY_ERROR + i] += cross
+        P[VELOCITY_ERROR + i, POSITION_ERROR + i] += cross
+        P[GYRO_BIAS_ERROR + i, GYRO_BIAS_ERROR + i] += noise[GYRO_WALK] ** 2 * dt
+        P[ACCEL_BIAS_ERROR + i, ACCEL_BIAS_ERROR + i] += noise[ACCEL_WALK] ** 2 * dt
+
+
+@njit(cache=True)
+def write_gravity_basis(x: Array, basis: Array) -> None:
+    """Write the (3, 2) tangent basis of gravity into basis (6,), as `nav_state.gravity_tangent` does."""
+    gx, gy, gz = x[GRAVITY], x[GRAVITY + 1], x[GRAVITY + 2]
+    norm = np.sqrt(gx * gx + gy * gy + gz * gz)
+    dx, dy, dz = gx / norm, gy / norm, gz / norm
+    if abs(dx) < 0.9:
+        fx, fy, fz = 0.0, dz, -dy
+    else:
+        fx, fy, fz = -dz, 0.0, dx
+    scale = np.sqrt(fx * fx + fy * fy + fz * fz)
+    fx, fy, fz = fx / scale, fy / scale, fz / scale
+    basis[0], basis[2], basis[4] = norm * fx, norm * fy, norm * fz
+    basis[1], basis[3], basis[5] = norm * (dy * fz - dz * fy), norm * (dz * fx - dx * fz), norm * (dx * fy - dy * fx)

@@ -1,0 +1,210 @@
+"""The filter's memory: two flat buffers, so that a call hands over two arrays and a snapshot is one copy."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from fusion.consensus import VOTE_SIZE
+from fusion.measurements import MAX_COLUMNS
+from fusion.nav_state import CORE, StateLayout
+
+Array = NDArray[np.float64]
+Ints = NDArray[np.int64]
+
+VOTES = 256  # a second of eight objects at 30 Hz
+
+# Counters, part of what a snapshot keeps.
+NOW, IMU_AT, MODE, BIAS_TIME, STARTED_AT, VOTE_HEAD, RESTARTS, LAST_UPDATE, UP_COUNT, N_COUNTERS = range(10)
+INITIALISING, TRACKING = 0, 1
+
+# Integer header: where things stand in the float buffer, sizes.
+(
+    AT_X,
+    AT_P,
+    AT_SCALES,
+    AT_UP,
+    END_OF_STATE,
+    AT_NOISE,
+    AT_LIMITS,
+    AT_START,
+    AT_BIAS_MODEL,
+    AT_AXES,
+    AT_PRIOR,
+    AT_WORK,
+    AT_VOTES,
+    H_N,
+    H_NX,
+    H_K,
+    AT_LAYOUT,
+    AT_COUNTERS,
+    AT_ORDERS,
+    AT_COLUMNS,
+    AT_VOTE_STAMPS,
+    AT_INLIERS,
+    HEADER,
+) = range(23)
+
+
+class Memory(NamedTuple):
+    """Views of the two buffers."""
+
+    x: Array
+    P: Array
+    scales: Array  # (K,) how much larger than stated each object's noise has shown itself
+    up: Array  # (3,) running mean of the specific force in the axes of the integrated motion
+    noise: Array
+    limits: Array  # chi-square limits both, rotation, position; partial; outlier scale; adaptation; reconsider
+    start: Array
+    bias_model: Array
+    axes: Array  # (K, 3) symmetry axes
+    prior: Array  # (n,) 1-sigma of the error state at the start
+    work: Array
+    votes: Array
+    layout: Ints
+    counters: Ints
+    orders: Ints  # (K,) symmetry order, 1 none, 0 continuous
+    columns: Ints
+    vote_stamps: Ints
+    inliers: Ints
+
+
+def allocate(layout: StateLayout) -> tuple[Array, Ints]:
+    """Return the zeroed buffers of a filter with this layout; `views` gives their parts names."""
+    n, nx, K = layout.n_error, layout.n_nominal, layout.n_objects
+    header = np.zeros(HEADER, dtype=np.int64)
+    header[H_N], header[H_NX], header[H_K] = n, nx, K
+    sizes: Sequence[tuple[int, int]] = (
+        (AT_X, nx),
+        (AT_P, n * n),
+        (AT_SCALES, max(K, 1)),
+        (AT_UP, 3),
+        (END_OF_STATE, 0),
+        (AT_NOISE, 8),
+        (AT_LIMITS, 8),
+        (AT_START, 16),
+        (AT_BIAS_MODEL, 10),
+        (AT_AXES, 3 * max(K, 1)),
+        (AT_PRIOR, n),
+        (AT_WORK, work_size(n)),
+        (AT_VOTES, VOTES * VOTE_SIZE),
+    )
+    at = 0
+    for name, size in sizes:
+        header[name] = at
+        at += size
+    floats = np.zeros(at)
+    whole = HEADER
+    counts: Sequence[tuple[int, int]] = (
+        (AT_LAYOUT, 10),
+        (AT_COUNTERS, N_COUNTERS),
+        (AT_ORDERS, max(K, 1)),
+        (AT_COLUMNS, MAX_COLUMNS),
+        (AT_VOTE_STAMPS, VOTES),
+        (AT_INLIERS, VOTES),
+    )
+    for name, size in counts:
+        header[name] = whole
+        whole += size
+    integers = np.zeros(whole, dtype=np.int64)
+    integers[:HEADER] = header
+    integers[header[AT_LAYOUT] : header[AT_LAYOUT] + 10] = layout.as_integers()
+    integers[header[AT_ORDERS] : header[AT_ORDERS] + max(K, 1)] = 1
+    return floats, integers
+
+
+@njit(cache=True)
+def work_size(n: int) -> int:
+    """Return how many floats of work space a filter with n error states needs."""
+    return 256 + 45 + 6 + 17 * CORE + 3 * n + 6 + 6 * MAX_COLUMNS + 6 * n + 36 + 36 + 36 + 6 + 6 * n + n + 12 + 128
+
+
+@njit(cache=True)
+def views(floats: Array, integers: Ints) -> Memory:
+    """Return the parts of the two buffers by name."""
+    n, nx, K = integers[H_N], integers[H_NX], max(integers[H_K], 1)
+    f, i = floats, integers
+
+    return Memory(
+        f[i[AT_X] : i[AT_X] + nx],
+        f[i[AT_P] : i[AT_P] + n * n].reshape((n, n)),
+        f[i[AT_SCALES] : i[AT_SCALES] + K],
+        f[i[AT_UP] : i[AT_UP] + 3],
+        f[i[AT_NOISE] : i[AT_NOISE] + 8],
+        f[i[AT_LIMITS] : i[AT_LIMITS] + 8],
+        f[i[AT_START] : i[AT_START] + 16],
+        f[i[AT_BIAS_MODEL] : i[AT_BIAS_MODEL] + 10],
+        f[i[AT_AXES] : i[AT_AXES] + 3 * K].reshape((K, 3)),
+        f[i[AT_PRIOR] : i[AT_PRIOR] + n],
+        f[i[AT_WORK] : i[AT_WORK] + work_size(n)],
+        f[i[AT_VOTES] : i[AT_VOTES] + VOTES * VOTE_SIZE].reshape((VOTES, VOTE_SIZE)),
+        i[i[AT_LAYOUT] : i[AT_LAYOUT] + 10],
+        i[i[AT_COUNTERS] : i[AT_COUNTERS] + N_COUNTERS],
+        i[i[AT_ORDERS] : i[AT_ORDERS] + K],
+        i[i[AT_COLUMNS] : i[AT_COLUMNS] + MAX_COLUMNS],
+        i[i[AT_VOTE_STAMPS] : i[AT_VOTE_STAMPS] + VOTES],
+        i[i[AT_INLIERS] : i[AT_INLIERS] + VOTES],
+    )
+
+
+class Work(NamedTuple):
+    """Scratch space of one update or one propagation."""
+
+    step: Array  # what propagate_nominal leaves
+    blocks: Array
+    basis: Array
+    core: Array
+    rows: Array
+    residual: Array
+    H: Array
+    PHt: Array
+    S: Array
+    R: Array
+    L: Array
+    white: Array
+    Z: Array
+    error: Array
+    measured: Array  # R_m (9), t_m (3)
+    scratch: Array
+
+
+@njit(cache=True)
+def work_views(work: Array, n: int) -> Work:
+    """Return the parts of the work space by name."""
+    a = 256
+    b = a + 45
+    c = b + 6
+    d = c + 17 * CORE
+    e = d + 3 * n
+    g = e + 6
+    h = g + 6 * MAX_COLUMNS
+    j = h + 6 * n
+    k = j + 36
+    m = k + 36
+    o = m + 36
+    p = o + 6
+    q = p + 6 * n
+    r = q + n
+    s = r + 12
+    return Work(
+        work[0:256],
+        work[a:b],
+        work[b:c],
+        work[c:d].reshape((17, CORE)),
+        work[d:e].reshape((3, n)),
+        work[e:g],
+        work[g:h].reshape((6, MAX_COLUMNS)),
+        work[h:j].reshape((6, n)),
+        work[j:k].reshape((6, 6)),
+        work[k:m].reshape((6, 6)),
+        work[m:o].reshape((6, 6)),
+        work[o:p],
+        work[p:q].reshape((6, n)),
+        work[q:r],
+        work[r:s],
+        work[s : s + 128],
+    )

@@ -1,0 +1,141 @@
+"""The options of the estimators: the one home of their defaults."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Literal
+
+
+@dataclass(frozen=True)
+class DetectionNoise:
+    """White noise of object poses that bring no covariance of their own: aligned with the viewing ray."""
+
+    across: float = 0.004
+    """1-sigma across the ray, as a share of the distance."""
+    along: float = 0.015
+    """1-sigma along the ray, as a share of the distance."""
+    rotation_deg: float = 2.5
+    """1-sigma of rotation per axis, deg."""
+
+
+@dataclass(frozen=True)
+class CameraNoise:
+    """White noise of camera poses that bring no covariance of their own."""
+
+    position: float = 0.03
+    """1-sigma of position per axis, m."""
+    rotation_deg: float = 2.0
+    """1-sigma of rotation per axis, deg."""
+
+
+@dataclass(frozen=True)
+class DetectionBias:
+    """What a pose network gets wrong for seconds: a first-order Gauss-Markov state per object."""
+
+    use: bool = True
+    """Estimate a bias per object."""
+    across: float = 0.012
+    """1-sigma across the ray, as a share of the distance."""
+    along: float = 0.035
+    """1-sigma along the ray, as a share of the distance."""
+    rotation_deg: float = 4.0
+    """1-sigma of rotation per axis, deg."""
+    correlation_s: float = 10.0
+    """Correlation time, s."""
+
+
+@dataclass(frozen=True)
+class Gate:
+    """What is refused."""
+
+    probability: float = 0.99
+    """Share of good measurements that pass; 1 switches the gate off."""
+    partial: bool = True
+    """Use the position of a detection whose rotation is refused, and the other way round."""
+    adaptation: float = 0.0
+    """How fast an object's noise follows its innovations, per measurement; 0: not at all."""
+    max_noise_scale: float = 100.0
+    """Largest variance factor that the adaptation may reach."""
+
+
+@dataclass(frozen=True)
+class Start:
+    """When the filter starts and starts again: votes that agree."""
+
+    min_votes: int = 8
+    """Votes that must agree before anything is published."""
+    min_span_s: float = 0.3
+    """Time that they must span, s."""
+    window_s: float = 1.0
+    """Votes so young count, s."""
+    longest_window_s: float = 5.0
+    """A slow sensor's votes count for so long, s."""
+    max_angle_deg: float = 12.0
+    """Votes agree within this angle, deg,"""
+    max_distance: float = 0.08
+    """and this distance, m,"""
+    max_lever: float = 0.04
+    """plus this share of the object's distance,"""
+    max_speed: float = 0.3
+    """plus so much per second between them, m/s."""
+    max_tilt_deg: float = 12.0
+    """A vote that tilts the measured gravity by more is refused, deg."""
+    lost_window_s: float = 1.0
+    """The filter is lost if in this time, s,"""
+    lost_share: float = 0.2
+    """less than this share of the detections was used"""
+    lost_min_votes: int = 12
+    """and more than so many refused ones agree with each other."""
+
+
+@dataclass(frozen=True)
+class Prior:
+    """1-sigma of what is not known at the start."""
+
+    attitude_deg: float = 10.0
+    """Attitude, deg."""
+    position: float = 0.2
+    """Position, m."""
+    velocity: float = 0.5
+    """Velocity, m/s."""
+    gyroscope_bias: float = 0.02
+    """Gyroscope bias, rad/s."""
+    accelerometer_bias: float = 0.15
+    """Accelerometer bias, m/s^2."""
+    extrinsic_rotation_deg: float = 3.0
+    """Camera-IMU rotation where it is estimated, deg."""
+    extrinsic_position: float = 0.03
+    """Camera-IMU translation where it is estimated, m."""
+    time_offset: float = 0.03
+    """Camera-IMU time offset where it is estimated, s."""
+    gravity_deg: float = 2.0
+    """Direction of gravity where it is estimated, deg."""
+
+
+@dataclass(frozen=True)
+class Gap:
+    """How an interruption of the IMU is bridged."""
+
+    longest_s: float = 0.1
+    """An interval longer than this is a gap, s."""
+    angular_rate: float = 0.5
+    """1-sigma of the angular rate inside a gap, rad/s."""
+    acceleration: float = 2.0
+    """1-sigma of the acceleration inside a gap, m/s^2."""
+
+
+@dataclass(frozen=True)
+class FuseOptions:
+    """Camera or object poses and an IMU become a trajectory."""
+
+    estimator: Literal["eskf", "graph", "batch"] = "eskf"
+    """eskf: error-state Kalman filter; graph: fixed-lag smoother; batch: the whole log at once."""
+    measurements: Literal["camera", "objects"] = "objects"
+    """camera: the solver's (or the log's own) camera poses; objects: each object's pose directly."""
+    noise: DetectionNoise = field(default_factory=DetectionNoise)
+    camera_noise: CameraNoise = field(default_factory=CameraNoise)
+    bias: DetectionBias = field(default_factory=DetectionBias)
+    gate: Gate = field(default_factory=Gate)
+    start: Start = field(default_factory=Start)
+    prior: Prior = field(default_factory=Prior)
+    gap: Gap = field(default_factory=Gap)

@@ -1,0 +1,215 @@
+"""From a log and options to what the filter reads: measurements, layout, memory."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.stats import chi2
+
+from fusion import consensus, eskf, filter_loop, imu, memory
+from fusion.measurements import CAMERA_POSE, OBJECT_POSE, Measurements, ray_aligned_covariance
+from fusion.nav_state import StateLayout, nominal_state
+from fusion.options import FuseOptions
+from poet_loc.core.input_error import InputError
+from poet_loc.core.records import Calibration, CameraPoses, ImuNoise, ImuSamples, LandmarkMap, ObjectPoses
+from poet_loc.io.log_folder import Log
+
+Array = NDArray[np.float64]
+
+NEAREST_OBJECT = 1e-3  # m
+
+
+@dataclass(frozen=True)
+class Problem:
+    """All that an estimator needs of a log, checked."""
+
+    path: Path
+    imu: ImuSamples
+    imu_noise: ImuNoise
+    calibration: Calibration
+    measurements: Measurements
+    layout: StateLayout
+    landmark_map: LandmarkMap | None
+
+    @property
+    def keys(self) -> list[tuple[int, int]]:
+        """(object_id, instance) of each object that a measurement may name."""
+        return [] if self.landmark_map is None else [landmark.key for landmark in self.landmark_map]
+
+
+def pose_problem(
+    log: Log, options: FuseOptions, camera_poses: CameraPoses | None = None, object_poses: ObjectPoses | None = None
+) -> Problem:
+    """Return what the options ask to be fused of a log.
+
+    Raises InputError where IMU, calibration, map or poses are missing.
+    """
+    if log.imu is None:
+        raise InputError("the log has no imu.csv, which fusion needs", path=log.path, fix="run localize alone")
+    calibration = log.calibration
+    if calibration is None or calibration.imu is None or calibration.T_cam_imu is None:
+        raise InputError(
+            "fusion needs T_cam_imu and the IMU's noise densities", path=log.path / "calibration.yaml", fix="add them"
+        )
+    layout = layout_for(log.landmark_map, options)
+    if options.measurements == "camera":
+        poses = camera_poses if camera_poses is not None else log.camera_poses
+        if poses is None:
+            raise InputError("there are no camera poses to fuse", path=log.path, fix="localize first, or fuse objects")
+        measured = camera_measurements(poses, calibration, options)
+    else:
+        if log.landmark_map is None:
+            raise InputError("there is no landmarks.json", path=log.path, fix="fuse camera poses instead")
+        detections = object_poses if object_poses is not None else log.detections(None)[1]
+        measured = object_measurements(detections, log.landmark_map, calibration, options)
+    return Problem(log.path, log.imu, calibration.imu, calibration, measured, layout, log.landmark_map)
+
+
+def landmark_of_detection(poses: ObjectPoses, landmark_map: LandmarkMap) -> NDArray[np.int64]:
+    """Return (N,) the landmark each detection names, -1 where the map has none.
+
+    Where a class has one landmark the instance number does not matter.
+    """
+    found = np.full(len(poses), -1, dtype=np.int64)
+    ids = landmark_map.object_ids
+    for k, landmark in enumerate(landmark_map):
+        same = poses.object_ids == landmark.object_id
+        if np.count_nonzero(ids == landmark.object_id) > 1:
+            same &= poses.instances == landmark.instance
+        found[same] = k
+    return found
+
+
+def object_measurements(
+    poses: ObjectPoses, landmark_map: LandmarkMap, calibration: Calibration, options: FuseOptions
+) -> Measurements:
+    """Return the detections that belong to a landmark, by stamp and landmark, with default noise where they bring none.
+
+    A detection in or behind the image plane (real networks write those when they fail) is left out.
+    """
+    landmark = landmark_of_detection(poses, landmark_map)
+    usable = (landmark >= 0) & (poses.T_cam_obj.translation[:, 2] > NEAREST_OBJECT)
+    poses, landmark = poses[usable], landmark[usable]
+    order = np.lexsort((landmark, poses.stamps_ns))
+    poses, landmark = poses[order], landmark[order]
+    noise = options.noise
+    t = poses.T_cam_obj.translation
+    covariances = ray_aligned_covariance(t, noise.across, noise.along, math.radians(noise.rotation_deg))
+    if poses.covariances is not None:
+        given = np.isfinite(poses.covariances).all(axis=(1, 2))
+        covariances[given] = poses.covariances[given]
+    return Measurements(
+        poses.stamps_ns + time_shift_ns(calibration),
+        np.full(len(poses), OBJECT_POSE, dtype=np.int64),
+        landmark,
+        poses.T_cam_obj.rotation.as_matrix().reshape(-1, 9),
+        np.ascontiguousarray(t),
+        covariances,
+    )
+
+
+def camera_measurements(poses: CameraPoses, calibration: Calibration, options: FuseOptions) -> Measurements:
+    """Return camera poses as measurements, with the options' noise where they bring none."""
+    noise = options.camera_noise
+    sigma = np.r_[np.full(3, math.radians(noise.rotation_deg)), np.full(3, noise.position)]
+    covariances = np.tile(np.diag(sigma**2), (len(poses), 1, 1))
+    if poses.covariances is not None:
+        given = np.isfinite(poses.covariances).all(axis=(1, 2))
+        covariances[given] = poses.covariances[given]
+    return Measurements(
+        poses.stamps_ns + time_shift_ns(calibration),
+        np.full(len(poses), CAMERA_POSE, dtype=np.int64),
+        np.full(len(poses), -1, dtype=np.int64),
+        poses.T_world_cam.rotation.as_matrix().reshape(-1, 9),
+        np.ascontiguousarray(poses.T_world_cam.translation),
+        covariances,
+    )
+
+
+def time_shift_ns(calibration: Calibration) -> int:
+    """Return what turns a camera stamp into an IMU stamp."""
+    return round(calibration.timeshift_cam_imu_s * 1e9)
+
+
+def layout_for(landmark_map: LandmarkMap | None, options: FuseOptions) -> StateLayout:
+    """Return which states the options ask for."""
+    if options.measurements == "camera" or landmark_map is None:
+        return StateLayout()
+    return StateLayout(n_objects=len(landmark_map), bias_kinds=int(options.bias.use))
+
+
+def fill_memory(problem: Problem, options: FuseOptions) -> tuple[Array, NDArray[np.int64]]:
+    """Return the buffers of a filter that has not begun yet."""
+    layout, landmark_map, imu_noise = problem.layout, problem.landmark_map, problem.imu_noise
+    calibration = problem.calibration
+    floats, integers = memory.allocate(layout)
+    m = memory.views.py_func(floats, integers)
+    T_imu_cam = None if calibration.T_cam_imu is None else calibration.T_cam_imu.inv()
+    T_world_obj = landmark_map.T_world_obj if layout.n_objects and landmark_map is not None else None
+    m.x[:] = nominal_state(layout, T_imu_cam=T_imu_cam, T_world_obj=T_world_obj)
+    m.noise[[imu.GYRO_NOISE, imu.ACCEL_NOISE, imu.GYRO_WALK, imu.ACCEL_WALK]] = (
+        imu_noise.gyroscope_noise_density,
+        imu_noise.accelerometer_noise_density,
+        imu_noise.gyroscope_random_walk,
+        imu_noise.accelerometer_random_walk,
+    )
+    m.noise[[imu.GAP_S, imu.GAP_RATE, imu.GAP_ACCEL]] = (
+        options.gap.longest_s,
+        options.gap.angular_rate,
+        options.gap.acceleration,
+    )
+    m.limits[: filter_loop.MAX_SCALE + 1] = _limits(options)
+    m.start[: consensus.LOST_MIN_VOTES + 1] = _start(options)
+    bias = options.bias
+    m.bias_model[:5] = 0.0
+    m.bias_model[eskf.BIAS_ROTATION] = math.radians(bias.rotation_deg)
+    m.bias_model[eskf.BIAS_ACROSS] = bias.across
+    m.bias_model[eskf.BIAS_ALONG] = bias.along
+    m.bias_model[eskf.BIAS_TAU] = bias.correlation_s
+    m.prior[:] = _prior(layout, options)
+    if landmark_map is not None and layout.n_objects:
+        for k, landmark in enumerate(landmark_map):
+            if landmark.symmetry is not None:
+                m.axes[k] = landmark.symmetry.axis
+                m.orders[k] = 0 if landmark.symmetry.order == "continuous" else landmark.symmetry.order
+    m.scales[:] = 1.0
+    return floats, integers
+
+
+def _limits(options: FuseOptions) -> list[float]:
+    gate = options.gate
+    both, half = chi2.ppf(gate.probability, 6), chi2.ppf(gate.probability, 3)
+    return [both, half, half, float(gate.partial), 0.0, gate.adaptation, gate.max_noise_scale]
+
+
+def _start(options: FuseOptions) -> list[float]:
+    start = options.start
+    values = {
+        consensus.MIN_VOTES: start.min_votes,
+        consensus.LONGEST_WINDOW_S: start.longest_window_s,
+        consensus.MAX_ANGLE: math.radians(start.max_angle_deg),
+        consensus.MAX_DISTANCE: start.max_distance,
+        consensus.MAX_LEVER: start.max_lever,
+        consensus.MAX_SPEED: start.max_speed,
+        consensus.MAX_TILT: math.radians(start.max_tilt_deg),
+        consensus.START_WINDOW_S: start.window_s,
+        consensus.START_MIN_SPAN_S: start.min_span_s,
+        consensus.LOST_WINDOW_S: start.lost_window_s,
+        consensus.LOST_SHARE: start.lost_share,
+        consensus.LOST_MIN_VOTES: start.lost_min_votes,
+    }
+    return [float(values[i]) for i in range(len(values))]
+
+
+def _prior(layout: StateLayout, options: FuseOptions) -> Array:
+    prior, sigma = options.prior, np.zeros(layout.n_error)
+    sigma[0:3] = math.radians(prior.attitude_deg)
+    sigma[3:6] = prior.position
+    sigma[6:9] = prior.velocity
+    sigma[9:12] = prior.gyroscope_bias
+    sigma[12:15] = prior.accelerometer_bias
+    return sigma

@@ -1,0 +1,68 @@
+"""What an estimator returns."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import RigidTransform
+
+from poet_loc.core.trajectory import Trajectory
+
+Array = NDArray[np.float64]
+Stamps = NDArray[np.int64]
+
+
+@dataclass(frozen=True)
+class GateLog:
+    """What became of every measurement, in order of time."""
+
+    stamps_ns: Stamps
+    """(M,) on the IMU's clock."""
+    object_ids: NDArray[np.int64]
+    """(M,) -1 for camera poses."""
+    instances: NDArray[np.int64]
+    nis: Array
+    """(M,) normalised innovation squared of all six rows; NaN before the start."""
+    nis_position: Array
+    """(M,) of the position rows alone."""
+    nis_rotation: Array
+    """(M,) of the rotation rows alone."""
+    position_accepted: NDArray[np.bool_]
+    rotation_accepted: NDArray[np.bool_]
+
+    def __len__(self) -> int:
+        return len(self.stamps_ns)
+
+
+@dataclass(frozen=True)
+class FuseResult:
+    """A fused trajectory with its uncertainty: rows at IMU samples and measurement stamps, from the start on."""
+
+    name: str
+    """fuse/<estimator>/<measurements>, as in summary.json."""
+    stamps_ns: Stamps
+    T_world_imu: RigidTransform
+    velocity: Array
+    """(N, 3) in world axes, m/s."""
+    gyroscope_bias: Array
+    """(N, 3) rad/s."""
+    accelerometer_bias: Array
+    """(N, 3) m/s^2."""
+    sigmas: Array
+    """(N, 15) 1-sigma of attitude (imu axes), position, velocity (world axes), gyroscope and accelerometer bias."""
+    pose_covariances: Array
+    """(N, 6, 6) of [e_r, e_t] with R_true = R Exp(e_r), t_true = t + e_t; rad^2, m^2."""
+    gate: GateLog
+    runtime_s: float
+    restarts: int = 0
+    """How often the filter was lost and started again."""
+
+    def __len__(self) -> int:
+        return len(self.stamps_ns)
+
+    @property
+    def trajectory(self) -> Trajectory:
+        """T_world_imu over time."""
+        return Trajectory(self.stamps_ns, self.T_world_imu)
