@@ -22,8 +22,24 @@ from poet_loc.io.whole_folder import write_whole_file
 Array = NDArray[np.float64]
 
 _HEADER = "scene_id,im_id,obj_id,score,R,t,time"
-_CELL_COUNTS = (1, 1, 1, 1, 9, 3, 1)
-_DTYPE = np.dtype([("ids", np.int64, (3,)), ("score", float), ("R", float, (9,)), ("t", float, (3,)), ("time", float)])
+_COMMAS = tuple(f"comma_{index}" for index in range(6))
+_DTYPE = np.dtype(
+    [
+        ("scene_id", np.int64),
+        (_COMMAS[0], "S1"),
+        ("im_id", np.int64),
+        (_COMMAS[1], "S1"),
+        ("obj_id", np.int64),
+        (_COMMAS[2], "S1"),
+        ("score", float),
+        (_COMMAS[3], "S1"),
+        ("R", float, (9,)),
+        (_COMMAS[4], "S1"),
+        ("t", float, (3,)),
+        (_COMMAS[5], "S1"),
+        ("time", float),
+    ]
+)
 _MM_PER_M = 1000.0
 _NEAREST_MEDIAN_MM = 20.0
 _FIX = f"a row is {_HEADER} with nine numbers in R and three in t, separated by spaces"
@@ -66,9 +82,11 @@ def read_bop_results(path: str | Path) -> BopResults:
     if distance < _NEAREST_MEDIAN_MM:
         what = f"t looks like metres (median length {distance:.3g})"
         raise InputError(what, path=path, fix="multiply by 1000: BOP keeps millimetres")
-    scene_ids, image_ids, object_ids = rows["ids"].T
     T_cam_obj = make_pose(Rotation.from_matrix(matrices), rows["t"] / _MM_PER_M)
-    return BopResults(scene_ids, image_ids, object_ids, rows["score"], T_cam_obj, rows["time"])
+    columns = {name: np.ascontiguousarray(rows[name]) for name in ("scene_id", "im_id", "obj_id", "score", "time")}
+    return BopResults(
+        columns["scene_id"], columns["im_id"], columns["obj_id"], columns["score"], T_cam_obj, columns["time"]
+    )
 
 
 def write_bop_results(path: str | Path, results: BopResults) -> None:
@@ -100,22 +118,25 @@ def _lines_after_header(path: str | Path) -> list[tuple[int, str]]:
 
 
 def _parse(path: str | Path, lines: list[tuple[int, str]]) -> NDArray[Any]:
-    text = "\n".join(line for _, line in lines)
     try:
-        if text.count(",") != len(lines) * (len(_CELL_COUNTS) - 1):
-            raise ValueError("the cells do not add up")
-        return np.loadtxt(io.StringIO(text.replace(",", " ")), _DTYPE, comments=None, ndmin=1)
+        return _rows("\n".join(line for _, line in lines))
     except (ValueError, OverflowError) as error:
         for number, line in lines:
-            counts = tuple(len(cell.split()) for cell in line.split(","))
-            if counts != _CELL_COUNTS or not _is_row(line):
+            if not _is_row(line):
                 raise InputError("is no row of BOP results", path=path, line=number, fix=_FIX) from None
         raise InputError(f"cannot be read: {error}", path=path, fix=_FIX) from error
 
 
+def _rows(text: str) -> NDArray[Any]:
+    """Return the rows of a text; a comma is a column of its own, so that each stands where it belongs."""
+    rows = np.loadtxt(io.StringIO(text.replace(",", " , ")), _DTYPE, comments=None, ndmin=1)
+    if any((rows[comma] != b",").any() for comma in _COMMAS):
+        raise ValueError("a comma is out of place")
+    return rows
+
+
 def _is_row(line: str) -> bool:
     try:
-        np.loadtxt([line.replace(",", " ")], _DTYPE, comments=None)
+        return len(_rows(line)) == 1
     except (ValueError, OverflowError):
         return False
-    return True
