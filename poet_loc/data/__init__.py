@@ -1,0 +1,1 @@
+"""Data: BOP sets, batches and the synthetic world."""

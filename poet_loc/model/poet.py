@@ -129,18 +129,17 @@ class PoET(nn.Module):
 
     def tokens(self, maps: Sequence[Tensor], image_mask: Tensor) -> Tokens:
         """Project feature maps to the network's width, add the extra levels, and lay them out as tokens."""
+        projected = self.project(maps)
+        masks = [mask_of_level(image_mask, level_map.shape[-2:]) for level_map in projected]
+        return self.transformer.tokens(projected, masks, [self.backbone[1](mask) for mask in masks])
+
+    def project(self, maps: Sequence[Tensor]) -> list[Tensor]:
+        """Return every level (B, d, h, w); the first extra level reads the raw last map, later ones the level before."""
         projected: list[Tensor] = []
-        masks: list[Tensor] = []
-        codes: list[Tensor] = []
-        last = maps[-1]
         for level, projection in enumerate(self.input_proj):
-            last = projected[-1] if level > len(maps) else last  # the first extra level reads the raw last map
-            level_map = projection(maps[level] if level < len(maps) else last)
-            mask = mask_of_level(image_mask, level_map.shape[-2:])
-            projected.append(level_map)
-            masks.append(mask)
-            codes.append(self.backbone[1](mask))
-        return self.transformer.tokens(projected, masks, codes)
+            extra = maps[-1] if level == len(maps) else projected[-1] if projected else maps[-1]
+            projected.append(projection(maps[level] if level < len(maps) else extra))
+        return projected
 
     def query_codes(self, queries: QueryBoxes) -> tuple[Tensor, Tensor]:
         """Return position and content (B, Q, d) of the queries."""
@@ -155,14 +154,23 @@ class PoET(nn.Module):
         code = torch.where(real_queries(queries)[..., None], code, torch.full_like(code, DUMMY_CODE))
         return code, code
 
+    def read_last(self, state: Tensor, queries: QueryBoxes, context: QueryContext) -> PoseOutput:
+        """Turn the last decoder state (B, Q, d) into poses."""
+        return self._read_layer(len(self.translation_head) - 1, state, queries, context)
+
     def read_out(self, states: Tensor, queries: QueryBoxes, context: QueryContext) -> PoseOutput:
-        """Turn decoder states (layers, B, Q, d) into poses: of all layers in training, else of the last."""
+        """Turn decoder states (layers, B, Q, d) into poses: of all layers in training, else of the last.
+
+        Always in float32: bfloat16 has three digits, a pose needs more.
+        """
         last = len(states) - 1
-        final = self._read_layer(last, states[last], queries, context)
-        if not self.training:
-            return final
-        earlier = tuple(self._read_layer(i, states[i], queries, context) for i in range(last))
-        return replace(final, auxiliary=earlier)
+        with torch.autocast(states.device.type, enabled=False):
+            states = states.float()
+            final = self._read_layer(last, states[last], queries, context)
+            if not self.training:
+                return final
+            earlier = tuple(self._read_layer(i, states[i], queries, context) for i in range(last))
+            return replace(final, auxiliary=earlier)
 
     def _read_layer(self, layer: int, state: Tensor, queries: QueryBoxes, context: QueryContext) -> PoseOutput:
         def read(heads: nn.ModuleList) -> Tensor:
