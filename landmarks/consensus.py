@@ -120,14 +120,12 @@ def sorted_by_tie_rule(votes: Votes, frame: Indices, members: Mask, options: Sol
     rank = np.arange(len(frame))  # sets of a frame stand in the order of the map
     if options.tie_rule == "order":
         return rank
-    size = members.sum(axis=1)
+    near = np.sum(np.where(members, np.linalg.norm(votes.t_cam_obj[frame], axis=-1), 0.0), axis=1) / members.sum(axis=1)
     if options.tie_rule == "score":
         key = -np.sum(np.where(members, votes.scores[frame], 0.0), axis=1)
-    elif options.tie_rule == "close":
-        key = np.sum(np.where(members, np.linalg.norm(votes.t_cam_obj[frame], axis=-1), 0.0), axis=1) / size
     else:
-        key = _spread(votes[frame], members, options)
-    return np.lexsort((rank, np.round(key, 9), frame))
+        key = _spread(votes[frame], members, options) if options.tie_rule == "compact" else near
+    return np.lexsort((rank, np.round(near, 9), np.round(key, 9), frame))
 
 
 def _spread(votes: Votes, members: Mask, options: SolverOptions) -> Array:

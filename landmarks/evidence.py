@@ -12,6 +12,8 @@ offers, for hold_s at most. Only the choice has a memory: the pose and covarianc
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
@@ -27,6 +29,24 @@ _CONTINUES = 2.0  # squared difference of white errors on average: one of the po
 _KEPT = 8  # hypotheses that are carried on from frame to frame
 
 
+@dataclass(frozen=True)
+class _Beliefs:
+    """Hypotheses that are alive."""
+
+    rows: Indices
+    """Row of the hypotheses."""
+    ages: Array
+    """Time since a vote supported it, s."""
+    evidence: Array
+
+    def __getitem__(self, index: slice | Indices | NDArray[np.bool_]) -> _Beliefs:
+        return _Beliefs(self.rows[index], self.ages[index], self.evidence[index])
+
+    def older(self, time_s: float, fade: float, oldest_s: float) -> _Beliefs:
+        aged = _Beliefs(self.rows, self.ages + time_s, self.evidence * fade)
+        return aged[aged.ages <= oldest_s]
+
+
 def choose_by_evidence(stamps_ns: Stamps, hypotheses: Hypotheses, memory: Memory) -> tuple[Indices, Array]:
     """Return the hypothesis that each frame believes, (F,), and its age in s: 0 where the frame's own votes cast it.
 
@@ -37,28 +57,34 @@ def choose_by_evidence(stamps_ns: Stamps, hypotheses: Hypotheses, memory: Memory
     bounds = np.searchsorted(hypotheses.frame, np.arange(len(stamps_ns) + 1))
     step_s = np.diff(stamps_ns, prepend=stamps_ns[:1]) * 1e-9
     fade = np.exp(-step_s / memory.evidence_s) if memory.evidence_s > 0.0 else np.zeros(len(stamps_ns))
-    chosen, chosen_age = np.empty(len(stamps_ns), np.intp), np.zeros(len(stamps_ns))
-    rows, ages, evidence = np.empty(0, np.intp), np.empty(0), np.empty(0)
+    chosen, age_s = np.empty(len(stamps_ns), np.intp), np.zeros(len(stamps_ns))
+    beliefs = _Beliefs(np.empty(0, np.intp), np.empty(0), np.empty(0))
     for frame in range(len(stamps_ns)):
         own = np.arange(bounds[frame], bounds[frame + 1])
-        ages, evidence = ages + step_s[frame], evidence * fade[frame]
-        young = ages <= memory.hold_s
-        rows, ages, evidence = rows[young], ages[young], evidence[young]
-        own_evidence = support[own]
-        if rows.size:
-            inherited = evidence * similarity(own, rows, ages)
-            parent = np.argmax(inherited, axis=1)
-            own_evidence = own_evidence + inherited[np.arange(len(own)), parent]
-            continued = parent[own_evidence >= evidence[parent]]
-            left = np.ones(len(rows), bool)
-            left[continued] = False
-            rows, ages, evidence = rows[left], ages[left], evidence[left]
-        rows, ages = np.concatenate([own, rows]), np.concatenate([np.zeros(len(own)), ages])
-        evidence = np.concatenate([own_evidence, evidence])
-        best = np.lexsort((similarity.variance[rows], -np.round(evidence, 9)))[:_KEPT]
-        rows, ages, evidence = rows[best], ages[best], evidence[best]
-        chosen[frame], chosen_age[frame] = rows[0], ages[0]
-    return chosen, chosen_age
+        earlier = beliefs.older(step_s[frame], fade[frame], memory.evidence_s)
+        beliefs = _continued(_Beliefs(own, np.zeros(len(own)), support[own]), earlier, similarity)
+        order = np.lexsort((similarity.variance[beliefs.rows], -np.round(beliefs.evidence, 9)))
+        beliefs = beliefs[order]
+        given = int(np.argmax(beliefs.ages <= memory.hold_s))
+        chosen[frame], age_s[frame] = beliefs.rows[given], beliefs.ages[given]
+        beliefs = beliefs[:_KEPT]
+    return chosen, age_s
+
+
+def _continued(own: _Beliefs, earlier: _Beliefs, similarity: _Similarity) -> _Beliefs:
+    """Return the frame's own hypotheses with what they inherit, and the earlier ones that they do not replace."""
+    if not len(earlier.rows):
+        return own
+    inherited = earlier.evidence * similarity(own.rows, earlier.rows, earlier.ages)
+    parent = np.argmax(inherited, axis=1)
+    evidence = own.evidence + inherited[np.arange(len(parent)), parent]
+    left = np.ones(len(earlier.rows), bool)
+    left[parent[evidence >= earlier.evidence[parent]]] = False
+    return _Beliefs(
+        np.concatenate([own.rows, earlier.rows[left]]),
+        np.concatenate([own.ages, earlier.ages[left]]),
+        np.concatenate([evidence, earlier.evidence[left]]),
+    )
 
 
 class _Similarity:

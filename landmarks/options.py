@@ -16,7 +16,7 @@ ORACLES: tuple[Mode, ...] = ("best",)
 TieRule = Literal["score", "close", "compact", "order"]
 """Which of several equally large sets of agreeing votes wins: the one with the highest sum of scores, the one whose
 objects are nearest to the camera on average, the one with the smallest spread, or the first in the order of the map;
-ties of the first three go by the order of the map."""
+what still ties goes to the nearest objects, then to the order of the map."""
 
 
 @dataclass(frozen=True)
@@ -40,15 +40,17 @@ class Memory:
     """What `robust` keeps of the past: which hypotheses about the camera were supported for how long."""
 
     evidence_s: float = 5.0
-    """Time constant with which support from earlier frames fades, s; 0: every frame on its own."""
+    """Time constant with which support from earlier frames fades, s; 0: every frame on its own. A hypothesis that no
+    vote supports for so long is forgotten."""
     hold_s: float = 2.0
-    """A pose that no vote of the frame supports is held so long while it has more evidence than the votes, s."""
+    """A pose that no vote of the frame supports is given out so long while it has more evidence than the votes, s;
+    0: every pose is cast by its own frame."""
     speed: float = 0.25
     """1-sigma of the camera's velocity per axis, m/s: how fast an older pose loses its say."""
     turn_rate_deg: float = 25.0
     """1-sigma of the camera's turn rate per axis, deg/s."""
     white_share: float = 0.25
-    """Share of a vote's variance that is new in every frame; the rest stays for seconds, as pose networks' errors do."""
+    """Share of a vote's variance that is new in every frame; the rest lasts for seconds, as networks' errors do."""
 
 
 @dataclass(frozen=True)
