@@ -39,7 +39,7 @@ def _broadcast(builder: ir.IRBuilder, scalar: Any, vector: ir.VectorType) -> Any
 
 
 @intrinsic
-def _sum_rows(typing_context, out, at, value, index, weight, count, width):  # type: ignore[no-untyped-def]
+def sum_rows(typing_context, out, at, value, index, weight, count, width):  # type: ignore[no-untyped-def]
     """out[at : at + D] = sum_i weight[i] value[index[i] : index[i] + D] with D = len(width), i < 4 count."""
     vector = ir.VectorType(ir.FloatType(), len(width))
     signature = types.void(out, types.intp, value, index, weight, types.intp, width)
@@ -66,22 +66,24 @@ def _sum_rows(typing_context, out, at, value, index, weight, count, width):  # t
 
 
 @numba.njit(fastmath=_FAST, error_model="numpy", inline="always")
-def _corners(x, y, share, width, height, start, stride, offset, index, weight, at):  # type: ignore[no-untyped-def]
-    """Write the four rows and weights of one bilinear sample at x, y (shares of the level); zeros outside."""
-    x = x * width - _HALF
-    y = y * height - _HALF
+def corner_rows(x, y, share, width, height, start, stride, offset, index, weight, at):  # type: ignore[no-untyped-def]
+    """Write the four rows and weights of one bilinear sample at cell x, y of a level; zeros outside."""
     left, top = np.floor(x), np.floor(y)
     fx, fy = x - left, y - top
-    right_of = width - _ONE
-    bottom_of = height - _ONE
-    wx0 = (_ONE - fx) if (left >= _ZERO) & (left <= right_of) else _ZERO
-    wx1 = fx if (left >= -_ONE) & (left < right_of) else _ZERO
-    wy0 = (_ONE - fy) * share if (top >= _ZERO) & (top <= bottom_of) else _ZERO
-    wy1 = fy * share if (top >= -_ONE) & (top < bottom_of) else _ZERO
-    x0 = left if (left >= _ZERO) & (left <= right_of) else _ZERO
-    x1 = left + _ONE if (left >= -_ONE) & (left < right_of) else _ZERO
-    y0 = top if (top >= _ZERO) & (top <= bottom_of) else _ZERO
-    y1 = top + _ONE if (top >= -_ONE) & (top < bottom_of) else _ZERO
+    right, bottom = left + _ONE, top + _ONE
+    last_x, last_y = width - _ONE, height - _ONE
+    x0 = left if left > _ZERO else _ZERO  # each comparison is false for an undefined location
+    x0 = x0 if x0 < last_x else last_x
+    x1 = right if right > _ZERO else _ZERO
+    x1 = x1 if x1 < last_x else last_x
+    y0 = top if top > _ZERO else _ZERO
+    y0 = y0 if y0 < last_y else last_y
+    y1 = bottom if bottom > _ZERO else _ZERO
+    y1 = y1 if y1 < last_y else last_y
+    wx0 = _ONE - fx if left == x0 else _ZERO
+    wx1 = fx if right == x1 else _ZERO
+    wy0 = (_ONE - fy) * share if top == y0 else _ZERO
+    wy1 = fy * share if bottom == y1 else _ZERO
     above, below = start + y0 * width, start + y1 * width
     weight[at] = wx0 * wy0
     weight[at + 1] = wx1 * wy0
@@ -105,10 +107,11 @@ def _forward(value, levels, locations, weights, out, width, first, last):  # typ
         for head in range(heads):
             offset = np.int32(head * depth)
             for i in range(samples):
-                x, y = locations[query, head, i, 0], locations[query, head, i, 1]
+                x = locations[query, head, i, 0] * levels[0, i] - _HALF
+                y = locations[query, head, i, 1] * levels[1, i] - _HALF
                 share = weights[query, head, i]
-                _corners(x, y, share, levels[0, i], levels[1, i], levels[2, i], stride, offset, index, weight, 4 * i)
-            _sum_rows(out, query * heads * depth + offset, value, index, weight, samples, width)  # type: ignore[call-arg]
+                corner_rows(x, y, share, levels[0, i], levels[1, i], levels[2, i], stride, offset, index, weight, 4 * i)
+            sum_rows(out, query * heads * depth + offset, value, index, weight, samples, width)  # type: ignore[call-arg]
 
 
 @numba.njit(fastmath=_FAST, error_model="numpy", nogil=True, cache=True)
@@ -127,10 +130,11 @@ def _backward(
         for query in range(queries):
             at = query * stride + offset
             for i in range(samples):
-                x, y = locations[query, head, i, 0], locations[query, head, i, 1]
                 w, h = levels[0, i], levels[1, i]
+                x = locations[query, head, i, 0] * w - _HALF
+                y = locations[query, head, i, 1] * h - _HALF
                 share = weights[query, head, i]
-                _corners(x, y, _ONE, w, h, levels[2, i], stride, offset, index, weight, 0)
+                corner_rows(x, y, _ONE, w, h, levels[2, i], stride, offset, index, weight, 0)
                 for corner in range(4):
                     row = index[corner]
                     scale = weight[corner] * share
@@ -140,7 +144,6 @@ def _backward(
                         total += g * value[row + d]
                         grad_value[row + d] += scale * g
                     dot[corner] = total
-                x, y = x * w - _HALF, y * h - _HALF
                 fx, fy = x - np.floor(x), y - np.floor(y)
                 left, top = np.floor(x), np.floor(y)
                 inside_left = _ONE if (left >= _ZERO) & (left < w) else _ZERO

@@ -134,7 +134,7 @@ class PoET(nn.Module):
         return self.transformer.tokens(projected, masks, [self.backbone[1](mask) for mask in masks])
 
     def project(self, maps: Sequence[Tensor]) -> list[Tensor]:
-        """Return every level (B, d, h, w); the first extra level reads the raw last map, later ones the level before."""
+        """Return every level (B, d, h, w): the first extra one reads the raw last map, later ones the level before."""
         projected: list[Tensor] = []
         for level, projection in enumerate(self.input_proj):
             extra = maps[-1] if level == len(maps) else projected[-1] if projected else maps[-1]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
@@ -113,7 +114,7 @@ class DecoderLayer(nn.Module):
 class Stack(nn.Module):
     """Layers under the name that the official weights use."""
 
-    def __init__(self, layers: list[nn.Module]) -> None:
+    def __init__(self, layers: Sequence[nn.Module]) -> None:
         super().__init__()
         self.layers = nn.ModuleList(layers)
 
@@ -156,6 +157,8 @@ class DeformableTransformer(nn.Module):
     def encode(self, tokens: Tokens) -> Tensor:
         """Return the memory (B, S, d); levels that do not take part keep their values."""
         chosen = self.options.encoder_maps
+        if not self.encoder.layers or chosen == ():
+            return tokens.values
         part, index = (tokens, None) if chosen is None else tokens.of_levels(chosen)
         references = encoder_references(part.shapes, part.valid_ratios)
         x = part.values
