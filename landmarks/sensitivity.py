@@ -77,9 +77,8 @@ def sensitivity(
     """
     options = options or SolverOptions()
     pooled: dict[SolverOptions, tuple[Array, Array]] = {}
-    for sweep, mode, value in (
-        (sweep, mode, value) for sweep in sweeps for mode in sweep.modes for value in sweep.values
-    ):
+    settings = [(mode, sweep.option, value) for sweep in sweeps for mode in sweep.modes for value in sweep.values]
+    for mode, option, value in settings:
         unchanged = replace(options, mode=mode)
         changed = with_option(unchanged, option, value)
         if changed not in pooled:
