@@ -64,9 +64,9 @@ def progress(steps: int) -> Iterator[Report]:
         yield _Bar(bar, task)
 
 
-def print_tables(tables: Iterable[Table]) -> None:
-    """Print tables that fit the terminal; into a pipe as markdown."""
-    if not sys.stdout.isatty():
+def print_tables(tables: Iterable[Table], rich: bool = False) -> None:
+    """Print tables that fit the terminal; into a pipe as markdown, unless rich is asked for."""
+    if not rich and not sys.stdout.isatty():
         print("\n".join(table.markdown() for table in tables), end="")
         return
     from rich.console import Console

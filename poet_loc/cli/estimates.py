@@ -1,0 +1,217 @@
+"""Every estimate of one log: all modes of the solver, all estimators of the fusion, and their errors."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Literal
+
+import numpy as np
+
+from fusion.options import FuseOptions
+from fusion.result import FuseResult
+from landmarks.localize import LocalizeOptions, LocalizeResult, localize
+from landmarks.options import MODES, ORACLES, Mode, SolverOptions
+from poet_loc.cli.terminal import Report
+from poet_loc.core.input_error import InputError
+from poet_loc.core.records import CameraPoses, ObjectPoses, Stamps
+from poet_loc.core.trajectory import Trajectory
+from poet_loc.io.log_folder import Log
+from poet_loc.report.evaluate import (
+    Body,
+    Estimate,
+    EvaluateOptions,
+    Evaluation,
+    evaluate,
+    frames_to_compare,
+    references_for_both_bodies,
+)
+from poet_loc.report.run_record import RunRecord
+
+Fusion = tuple[Literal["eskf", "graph", "batch"], Literal["camera", "objects"]]
+
+FUSIONS: tuple[Fusion, ...] = (("eskf", "objects"), ("eskf", "camera"))
+
+
+@dataclass(frozen=True)
+class StageOptions:
+    """The options of every stage that a log goes through."""
+
+    solver: SolverOptions = field(default_factory=SolverOptions)
+    """How votes become a camera pose; its mode is the one whose camera poses are fused."""
+    fusion: FuseOptions = field(default_factory=FuseOptions)
+    """How poses and a motion source become a trajectory."""
+    evaluation: EvaluateOptions = field(default_factory=EvaluateOptions)
+    """When an estimate counts at a frame."""
+
+
+@dataclass(frozen=True)
+class Estimates:
+    """What was made of one log with one set of detections."""
+
+    log: Log
+    detections: str | None
+    """Name of the set of detections; None where the log's own camera poses were taken."""
+    localized: tuple[LocalizeResult, ...]
+    fused: tuple[FuseResult, ...]
+    evaluation: Evaluation | None
+    """None without ground truth."""
+
+    @property
+    def record(self) -> RunRecord:
+        """What figures, recordings and files take."""
+        calibration = self.log.calibration
+        return RunRecord(
+            estimates=_estimates(self.log, self.localized, self.fused),
+            references=_references(self.log),
+            evaluation=self.evaluation,
+            fused=self.fused,
+            landmark_map=self.log.landmark_map,
+            detections=None if self.detections is None else self.log.object_poses[self.detections],
+            voted={result.name: result.estimates.voted for result in self.localized},
+            camera=None if calibration is None else calibration.camera,
+            T_cam_imu=None if calibration is None else calibration.T_cam_imu,
+        )
+
+
+def estimate_log(
+    log: Log,
+    detections: str | None,
+    options: StageOptions,
+    report: Report,
+    modes: Sequence[Mode] = MODES,
+    fusions: Sequence[Fusion] = FUSIONS,
+) -> Estimates:
+    """Localise in these modes, fuse by these estimators, and evaluate; what the log lacks is noted and left out.
+
+    Raises InputError where nothing at all can be estimated.
+    """
+    name = None
+    if log.object_poses and log.landmark_map is not None:
+        name = log.detections(detections)[0]
+    elif detections is not None or log.camera_poses is None:
+        log.detections(detections)
+    localized = tuple(_localized(log, name, options.solver, report, modes)) if name is not None else ()
+    fused = tuple(_fused(log, name, localized, options, report, fusions))
+    if not localized and not fused:
+        raise InputError("nothing can be estimated", path=log.path, fix="see the lines above")
+    evaluation = evaluate_estimates(log, name, _estimates(log, localized, fused), options.evaluation, report)
+    return Estimates(log, name, localized, fused, evaluation)
+
+
+def steps(modes: Sequence[Mode] = MODES, fusions: Sequence[Fusion] = FUSIONS) -> int:
+    """Return how many steps `estimate_log` announces at most."""
+    return len(modes) + len(fusions) + 1
+
+
+def camera_poses_to_fuse(log: Log, localized: LocalizeResult | None) -> CameraPoses | None:
+    """Return the log's own camera poses, else the solver's without those that only repeat an earlier one."""
+    if log.camera_poses is not None:
+        return log.camera_poses
+    return None if localized is None else localized.estimates.camera_poses[~localized.estimates.held]
+
+
+def evaluate_estimates(
+    log: Log,
+    detections: str | None,
+    estimates: Sequence[Estimate],
+    options: EvaluateOptions,
+    report: Report,
+) -> Evaluation | None:
+    """Return the errors of the estimates; None, with a note, where the log has no ground truth for any of them."""
+    report.step("evaluate")
+    references = _references(log)
+    known = [estimate for estimate in estimates if estimate.body in references]
+    if not known:
+        report.note(f"{log.path}: no ground truth of the camera or the IMU: no errors")
+        return None
+    missing = {estimate.body for estimate in estimates} - references.keys()
+    if missing:
+        report.note(f"{log.path}: no T_world_{missing.pop()}.tum and no extrinsics: no errors of what follows it")
+    sensor_ns = _sensor_stamps(log, detections)
+    truth_ns = references["cam" if "cam" in references else "imu"].stamps_ns
+    frames_ns = frames_to_compare(truth_ns, sensor_ns) if log.frames is None else log.frames.stamps_ns
+    span_ns = (int(sensor_ns.min()), int(sensor_ns.max()))
+    return evaluate(known, references, span_ns, options, frames_ns)
+
+
+def _localized(log: Log, detections: str | None, options: SolverOptions, report: Report, modes: Sequence[Mode]):  # type: ignore[no-untyped-def]
+    for mode in modes:
+        report.step(f"localize {mode}")
+        if mode in ORACLES and log.T_world_cam is None:
+            report.note(f"{log.path}: no T_world_cam.tum: no localize/{mode}, which looks at the ground truth")
+            continue
+        yield localize(log, _localize_options(options, mode, detections))
+
+
+def _fused(  # type: ignore[no-untyped-def]
+    log: Log,
+    detections: str | None,
+    localized: Sequence[LocalizeResult],
+    options: StageOptions,
+    report: Report,
+    fusions: Sequence[Fusion],
+):
+    lacking = _lacking_for_fusion(log)
+    if lacking and fusions:
+        report.note(f"{log.path}: {lacking}: no fusion, localisation only")
+        return
+    from fusion.fuse import fuse
+
+    solved = {result.name: result for result in localized}.get(f"localize/{options.solver.mode}")
+    camera_poses = camera_poses_to_fuse(log, solved)
+    object_poses = None if detections is None else log.object_poses[detections]
+    for estimator, measurements in fusions:
+        report.step(f"fuse {estimator} {measurements}")
+        if (camera_poses if measurements == "camera" else object_poses) is None:
+            continue
+        choice = replace(options.fusion, estimator=estimator, measurements=measurements)
+        try:
+            yield fuse(log, choice, camera_poses=camera_poses, object_poses=object_poses)
+        except InputError as error:
+            report.note(f"{error}: no fuse/{estimator}/{measurements}")
+
+
+def _localize_options(options: SolverOptions, mode: Mode, detections: str | None) -> LocalizeOptions:
+    values = {name: getattr(options, name) for name in SolverOptions.__dataclass_fields__}
+    return LocalizeOptions(**{**values, "mode": mode}, detections=detections)
+
+
+def _lacking_for_fusion(log: Log) -> str:
+    calibration = log.calibration
+    if log.imu is None:
+        return "no imu.csv"
+    if calibration is None:
+        return "no calibration.yaml"
+    if calibration.T_cam_imu is None:
+        return "no T_cam_imu in calibration.yaml"
+    return "" if calibration.imu is not None else "no imu0 in calibration.yaml"
+
+
+def _estimates(log: Log, localized: Sequence[LocalizeResult], fused: Sequence[FuseResult]) -> tuple[Estimate, ...]:
+    given = [] if log.camera_poses is None else [Estimate.of_camera_poses("localize/given", log.camera_poses)]
+    solved = [
+        Estimate.of_camera_poses(
+            result.name,
+            result.estimates.camera_poses,
+            result.runtime_s,
+            oracle=result.name.removeprefix("localize/") in ORACLES,
+        )
+        for result in localized
+    ]
+    return (*given, *solved, *(Estimate.of_fused(result) for result in fused))
+
+
+def _references(log: Log) -> Mapping[Body, Trajectory]:
+    there: dict[Body, Trajectory] = {}
+    if log.T_world_cam is not None:
+        there["cam"] = log.T_world_cam
+    if log.T_world_imu is not None:
+        there["imu"] = log.T_world_imu
+    return references_for_both_bodies(there, None if log.calibration is None else log.calibration.T_cam_imu)
+
+
+def _sensor_stamps(log: Log, detections: str | None) -> Stamps:
+    source: ObjectPoses | CameraPoses | None = log.camera_poses if detections is None else log.object_poses[detections]
+    assert source is not None
+    return np.asarray(source.stamps_ns)
