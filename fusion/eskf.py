@@ -38,7 +38,7 @@ from fusion.so3_kernels import exp_so3, log_so3, multiply, multiply_transposed_l
 REJECTED, POSITION_ONLY, ROTATION_ONLY, ACCEPTED = 0, 1, 2, 3  # bit 0: position used, bit 1: rotation used
 
 # Places in the bias model, per kind: sigma of rotation (rad), across and along the ray (share of distance), time (s).
-BIAS_ROTATION, BIAS_ACROSS, BIAS_ALONG, BIAS_TAU, BIAS_MODEL_SIZE = range(5)
+BIAS_ROTATION, BIAS_ACROSS, BIAS_ALONG, BIAS_TAU, BIAS_JUMP, BIAS_MODEL_SIZE = range(6)
 
 
 @njit(cache=True)
@@ -93,11 +93,11 @@ def whiten(L: Array, residual: Array, first: int, size: int, white: Array) -> fl
 
 
 @njit(cache=True)
-def gate(S: Array, residual: Array, limits: Array, partial: bool, L: Array, white: Array, nis: Array) -> int:
+def gate(S: Array, residual: Array, limits: Array, partial: float, L: Array, white: Array, nis: Array) -> int:
     """Decide what of a measurement to use; write its NIS [both, rotation, position] into nis (3,).
 
     limits (3,) are chi-square limits for both, rotation alone, position alone. A rotation that contradicts the
-    state does not cost the position its update, and the other way round, where `partial` is on.
+    state does not cost the position its update (partial >= 1), nor the other way round (partial >= 2).
     """
     nis[0] = nis[1] = nis[2] = np.inf
     if cholesky(S, 3, 3, L):
@@ -108,9 +108,9 @@ def gate(S: Array, residual: Array, limits: Array, partial: bool, L: Array, whit
     nis[1] = white[0] * white[0] + white[1] * white[1] + white[2] * white[2]
     if nis[0] <= limits[0]:
         return ACCEPTED
-    if partial and nis[2] <= limits[2]:
+    if partial >= 1.0 and nis[2] <= limits[2]:
         return POSITION_ONLY
-    if partial and nis[1] <= limits[1]:
+    if partial >= 2.0 and nis[1] <= limits[1]:
         return ROTATION_ONLY
     return REJECTED
 
@@ -290,6 +290,20 @@ def decay_biases(x: Array, P: Array, seconds: float, bias_model: Array, layout: 
                 for j in range(n):
                     P[j, at + i] *= phi
                 P[at + i, at + i] += (1.0 - phi * phi) * sigma * sigma
+
+
+@njit(cache=True)
+def forget_bias(x: Array, P: Array, k: int, first: int, bias_model: Array, layout: Ints) -> None:
+    """Let an object's varying bias of rotation (first 0) or translation (3) have jumped.
+
+    Its mean becomes zero again and its sigma a multiple of the stationary one; what it knew of other states is dropped.
+    """
+    n, at, b = layout[N_ERROR], layout[AT_BIASES] + 6 * k, layout[BIASES] + 6 * k
+    for i in range(first, first + 3):
+        x[b + i] = 0.0
+        for j in range(n):
+            P[at + i, j] = P[j, at + i] = 0.0
+        P[at + i, at + i] = (bias_model[BIAS_JUMP] * bias_sigma(bias_model, 0, i)) ** 2
 
 
 @njit(cache=True)

@@ -15,6 +15,7 @@ from fusion.consensus import (
     LOST_MIN_VOTES,
     LOST_SHARE,
     LOST_WINDOW_S,
+    MIN_SHARE,
     MIN_VOTES,
     START_MIN_SPAN_S,
     START_WINDOW_S,
@@ -26,10 +27,12 @@ from fusion.eskf import (
     ACCEPTED,
     POSITION_ONLY,
     REJECTED,
+    ROTATION_ONLY,
     bias_sigma,
     correct,
     decay_biases,
     fit_symmetry,
+    forget_bias,
     gate,
     innovation,
 )
@@ -80,7 +83,7 @@ from fusion.so3_kernels import (
 )
 
 # Places in the limits.
-LIMIT_BOTH, LIMIT_ROTATION, LIMIT_POSITION, PARTIAL, NOMINAL_OFFSET, ADAPTATION, MAX_SCALE = range(7)
+LIMIT_BOTH, LIMIT_ROTATION, LIMIT_POSITION, PARTIAL, NOMINAL_OFFSET, ADAPTATION, MAX_SCALE, JUMP_AFTER = range(8)
 
 OUT_CORE, OUT_SIGMA, OUT_COVARIANCE = 21, 15, 36
 
@@ -190,6 +193,7 @@ def measure(
                 decisions[j] = _update(m, w, kinds[j], k, R_m, t_m, covariances[j], rate, nis[j])
                 accepted = accepted or decisions[j] != REJECTED
     for j in range(first, last):
+        _follow_jumps(m, kinds[j], objects[j], decisions[j])
         _vote(m, w, kinds[j], objects[j], rotations[j], translations[j], decisions[j])
     if accepted:
         c[LAST_UPDATE] = c[NOW]
@@ -227,7 +231,7 @@ def _update(
         kind, k, R_m, t_m, m.x, rate, m.limits[NOMINAL_OFFSET], m.layout, w.residual, w.H, m.columns, w.step
     )
     innovation(m.P, w.H, m.columns, count, w.R, n, w.PHt, w.S)
-    decision = gate(w.S, w.residual, m.limits, m.limits[PARTIAL] > 0.0, w.L, w.white, nis)
+    decision = gate(w.S, w.residual, m.limits, m.limits[PARTIAL], w.L, w.white, nis)
     if kind == OBJECT_POSE and m.limits[ADAPTATION] > 0.0:
         _adapt_scale(m, k, nis[0])
     if decision == ACCEPTED:
@@ -236,6 +240,19 @@ def _update(
         start = 3 if decision == POSITION_ONLY else 0
         correct(m.x, m.P, w.PHt, w.S, w.residual, start, 3, m.layout, w.L, w.white, w.Z, w.error, w.scratch)
     return decision
+
+
+@njit(cache=True)
+def _follow_jumps(m: Memory, kind: int, k: int, decision: int) -> None:
+    """Networks err in runs: an object refused often in a row has another bias now, so its old one is forgotten."""
+    if kind != OBJECT_POSE or m.counters[MODE] != TRACKING or m.layout[N_BIAS_KINDS] == 0:
+        return
+    for part in range(2):
+        used = decision & (POSITION_ONLY if part == 1 else ROTATION_ONLY)
+        m.refused[k, part] = 0.0 if used else m.refused[k, part] + 1.0
+        if m.refused[k, part] >= m.limits[JUMP_AFTER]:
+            forget_bias(m.x, m.P, k, 3 * part, m.bias_model, m.layout)
+            m.refused[k, part] = 0.0
 
 
 @njit(cache=True)
@@ -342,7 +359,8 @@ def _agreement_beside(m: Memory, w: Work, first: int, share_of_velocity: float) 
 def _try_to_start(m: Memory, w: Work) -> None:
     first = _first_vote(m, m.start[START_WINDOW_S], 2 * int(m.start[MIN_VOTES]))
     count, span = _agreement(m, w, first)
-    if count < m.start[MIN_VOTES] or span < m.start[START_MIN_SPAN_S]:
+    enough = max(m.start[MIN_VOTES], m.start[MIN_SHARE] * (m.counters[VOTE_HEAD] - first))
+    if count < enough or span < m.start[START_MIN_SPAN_S]:
         return
     _adopt(m, w, 0)
     m.counters[MODE], m.counters[STARTED_AT] = TRACKING, m.counters[NOW]
@@ -351,7 +369,9 @@ def _try_to_start(m: Memory, w: Work) -> None:
 @njit(cache=True)
 def _restart_if_lost(m: Memory, w: Work) -> None:
     """Start again where hardly anything of late was accepted and what was refused agrees with itself."""
-    first, head = _first_vote(m, m.start[LOST_WINDOW_S], int(m.start[LOST_MIN_VOTES])), m.counters[VOTE_HEAD]
+    since_start = (m.counters[NOW] - m.counters[STARTED_AT]) * 1e-9
+    window = min(m.start[LOST_WINDOW_S], max(m.start[START_WINDOW_S], since_start))  # a wrong start is mended soon
+    first, head = _first_vote(m, window, int(m.start[LOST_MIN_VOTES])), m.counters[VOTE_HEAD]
     if head - first < m.start[LOST_MIN_VOTES]:
         return
     used = 0.0
@@ -364,6 +384,7 @@ def _restart_if_lost(m: Memory, w: Work) -> None:
     if count > m.start[LOST_MIN_VOTES] and count > 3.0 * used:
         _adopt(m, w, GYRO_BIAS_ERROR)
         m.counters[RESTARTS] += 1
+        m.counters[STARTED_AT] = m.counters[NOW]
 
 
 @njit(cache=True)

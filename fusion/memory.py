@@ -27,6 +27,7 @@ INITIALISING, TRACKING = 0, 1
     AT_X,
     AT_P,
     AT_SCALES,
+    AT_REFUSED,
     AT_UP,
     END_OF_STATE,
     AT_NOISE,
@@ -47,7 +48,7 @@ INITIALISING, TRACKING = 0, 1
     AT_VOTE_STAMPS,
     AT_INLIERS,
     HEADER,
-) = range(23)
+) = range(24)
 
 
 class Memory(NamedTuple):
@@ -56,9 +57,10 @@ class Memory(NamedTuple):
     x: Array
     P: Array
     scales: Array  # (K,) how much larger than stated each object's noise has shown itself
+    refused: Array  # (K, 2) how often in a row each object's rotation and position were refused
     up: Array  # (3,) running mean of the specific force in the axes of the integrated motion
     noise: Array
-    limits: Array  # chi-square limits both, rotation, position; partial; outlier scale; adaptation; reconsider
+    limits: Array  # places: filter_loop.LIMIT_BOTH and following
     start: Array
     bias_model: Array
     axes: Array  # (K, 3) symmetry axes
@@ -82,12 +84,13 @@ def allocate(layout: StateLayout) -> tuple[Array, Ints]:
         (AT_X, nx),
         (AT_P, n * n),
         (AT_SCALES, max(K, 1)),
+        (AT_REFUSED, 2 * max(K, 1)),
         (AT_UP, 3),
         (END_OF_STATE, 0),
         (AT_NOISE, 8),
         (AT_LIMITS, 8),
         (AT_START, 16),
-        (AT_BIAS_MODEL, 10),
+        (AT_BIAS_MODEL, 12),
         (AT_AXES, 3 * max(K, 1)),
         (AT_PRIOR, n),
         (AT_WORK, work_size(n)),
@@ -133,11 +136,12 @@ def views(floats: Array, integers: Ints) -> Memory:
         f[i[AT_X] : i[AT_X] + nx],
         f[i[AT_P] : i[AT_P] + n * n].reshape((n, n)),
         f[i[AT_SCALES] : i[AT_SCALES] + K],
+        f[i[AT_REFUSED] : i[AT_REFUSED] + 2 * K].reshape((K, 2)),
         f[i[AT_UP] : i[AT_UP] + 3],
         f[i[AT_NOISE] : i[AT_NOISE] + 8],
         f[i[AT_LIMITS] : i[AT_LIMITS] + 8],
         f[i[AT_START] : i[AT_START] + 16],
-        f[i[AT_BIAS_MODEL] : i[AT_BIAS_MODEL] + 10],
+        f[i[AT_BIAS_MODEL] : i[AT_BIAS_MODEL] + 12],
         f[i[AT_AXES] : i[AT_AXES] + 3 * K].reshape((K, 3)),
         f[i[AT_PRIOR] : i[AT_PRIOR] + n],
         f[i[AT_WORK] : i[AT_WORK] + work_size(n)],

@@ -13,7 +13,7 @@ from scipy.stats import chi2
 from fusion import consensus, eskf, filter_loop, imu, memory
 from fusion.measurements import CAMERA_POSE, OBJECT_POSE, Measurements, ray_aligned_covariance
 from fusion.nav_state import StateLayout, nominal_state
-from fusion.options import FuseOptions
+from fusion.options import DetectionBias, FuseOptions
 from poet_loc.core.input_error import InputError
 from poet_loc.core.records import Calibration, CameraPoses, ImuNoise, ImuSamples, LandmarkMap, ObjectPoses
 from poet_loc.io.log_folder import Log
@@ -139,7 +139,13 @@ def layout_for(landmark_map: LandmarkMap | None, options: FuseOptions) -> StateL
     """Return which states the options ask for."""
     if options.measurements == "camera" or landmark_map is None:
         return StateLayout()
-    return StateLayout(n_objects=len(landmark_map), bias_kinds=int(options.bias.use))
+    return StateLayout(n_objects=len(landmark_map), bias_kinds=_bias_kinds(options.bias))
+
+
+def _bias_kinds(bias: DetectionBias) -> int:
+    if not bias.use:
+        return 0
+    return 1 + (max(bias.steady_across, bias.steady_along, bias.steady_rotation_deg) > 0.0)
 
 
 def fill_memory(problem: Problem, options: FuseOptions) -> tuple[Array, NDArray[np.int64]]:
@@ -162,14 +168,18 @@ def fill_memory(problem: Problem, options: FuseOptions) -> tuple[Array, NDArray[
         options.gap.angular_rate,
         options.gap.acceleration,
     )
-    m.limits[: filter_loop.MAX_SCALE + 1] = _limits(options)
-    m.start[: consensus.LOST_MIN_VOTES + 1] = _start(options)
+    m.limits[: filter_loop.JUMP_AFTER + 1] = _limits(options)
+    m.start[: consensus.MIN_SHARE + 1] = _start(options)
     bias = options.bias
-    m.bias_model[:5] = 0.0
+    m.bias_model[:] = 0.0
     m.bias_model[eskf.BIAS_ROTATION] = math.radians(bias.rotation_deg)
     m.bias_model[eskf.BIAS_ACROSS] = bias.across
     m.bias_model[eskf.BIAS_ALONG] = bias.along
     m.bias_model[eskf.BIAS_TAU] = bias.correlation_s
+    m.bias_model[eskf.BIAS_JUMP] = bias.jump
+    steady = m.bias_model[eskf.BIAS_MODEL_SIZE :]
+    steady[eskf.BIAS_ROTATION] = math.radians(bias.steady_rotation_deg)
+    steady[[eskf.BIAS_ACROSS, eskf.BIAS_ALONG, eskf.BIAS_TAU]] = bias.steady_across, bias.steady_along, math.inf
     m.prior[:] = _prior(layout, options)
     if landmark_map is not None and layout.n_objects:
         for k, landmark in enumerate(landmark_map):
@@ -183,7 +193,16 @@ def fill_memory(problem: Problem, options: FuseOptions) -> tuple[Array, NDArray[
 def _limits(options: FuseOptions) -> list[float]:
     gate = options.gate
     both, half = chi2.ppf(gate.probability, 6), chi2.ppf(gate.probability, 3)
-    return [both, half, half, float(gate.partial), 0.0, gate.adaptation, gate.max_noise_scale]
+    return [
+        both,
+        half,
+        half,
+        float(("none", "position", "both").index(gate.partial)),
+        0.0,
+        gate.adaptation,
+        gate.max_noise_scale,
+        options.bias.jump_after,
+    ]
 
 
 def _start(options: FuseOptions) -> list[float]:
@@ -201,6 +220,7 @@ def _start(options: FuseOptions) -> list[float]:
         consensus.LOST_WINDOW_S: start.lost_window_s,
         consensus.LOST_SHARE: start.lost_share,
         consensus.LOST_MIN_VOTES: start.lost_min_votes,
+        consensus.MIN_SHARE: start.min_share,
     }
     return [float(values[i]) for i in range(len(values))]
 
