@@ -7,6 +7,7 @@ goes on where it stopped.
 from __future__ import annotations
 
 import shutil
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -69,7 +70,7 @@ def render(options: RenderOptions) -> Path:
     )
     tasks = (delayed(render_scene)(options, number, count) for number, count in missing)
     done = workers(tasks) if missing else ()
-    _show(done, len(counts), len(counts) - len(missing), options.progress)
+    show_progress(done, len(counts), len(counts) - len(missing), "scenes", options.progress)
     return folder
 
 
@@ -98,11 +99,12 @@ def render_scene(options: RenderOptions, number: int, count: int) -> int:
     return number
 
 
-def _show(done, total: int, already: int, visible: bool) -> None:  # type: ignore[no-untyped-def]
+def show_progress(done: Iterable[object], total: int, already: int, noun: str, visible: bool) -> None:
+    """Draw a bar while `done` yields one result after the other."""
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-    columns = (TextColumn("rendering"), BarColumn(), MofNCompleteColumn(), TextColumn("scenes"), TimeRemainingColumn())
+    columns = (TextColumn("rendering"), BarColumn(), MofNCompleteColumn(), TextColumn(noun), TimeRemainingColumn())
     with Progress(*columns, disable=not visible) as progress:
-        task = progress.add_task("scenes", total=total, completed=already)
+        task = progress.add_task(noun, total=total, completed=already)
         for _ in done:
             progress.advance(task)

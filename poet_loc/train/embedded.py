@@ -17,7 +17,7 @@ from poet_loc.model.options import NetworkOptions
 from poet_loc.model.poet import PoET, PoseOutput
 from poet_loc.model.queries import QueryBoxes, normalise_boxes, real_queries, stack_queries
 from poet_loc.model.small_detector import SmallDetector
-from poet_loc.train.detector import batch_numbers, image_batch
+from poet_loc.train.detector import batch_numbers, detector_losses, image_batch, targets_of, validate_detector
 from poet_loc.train.steps import Losses, StepOptions, train_steps
 
 EMBEDDED = NetworkOptions(
@@ -167,7 +167,7 @@ class TrainEmbeddedOptions:
     jitter: float = 0.04
     """Standard deviation of the boxes' corners, share of the box."""
     fine_tune: bool = False
-    """Let the detector's trunk follow the pose losses (its heads then need training again)."""
+    """Train the detector with its own losses beside the pose losses, instead of freezing it as the paper does."""
     train_split: str = "train"
     val_split: str = "val"
     val_images: int = 400
@@ -189,22 +189,31 @@ def train_embedded(options: TrainEmbeddedOptions, detector: SmallDetector) -> Po
             nn.init.normal_(head.get_parameter("layers.2.weight"), std=0.01)  # start at the box's ray and depth
     if options.fine_tune:
         network.backbone[0].requires_grad_(True)
-    seed = options.steps.seed
+    seed, classes = options.steps.seed, options.network.class_count
 
     def losses(module: PoET, step: int) -> Losses:
         module.train()
+        module.backbone[0].train(options.fine_tune)
         numbers = batch_numbers(step, options.steps.batch, len(train), seed)
         rngs = [np.random.default_rng([seed, 31, step, i]) for i in range(len(numbers))]
         samples = [train.sample(n, rng, options.augment) for n, rng in zip(numbers, rngs)]
         boxes = [jittered(sample.boxes, rng, options.jitter) for sample, rng in zip(samples, rngs)]
         batch = image_batch(samples)
         queries, truth = queries_and_truth(samples, boxes, batch.size, options.network.queries, models)
-        output = module.poses(module.extract(batch), batch.mask, queries, batch.intrinsics)
+        features = module.extract(batch)
+        output = module.poses(features, batch.mask, queries, batch.intrinsics)
         with torch.autocast("cpu", enabled=False):
-            return pose_losses(output, truth, options.loss)
+            parts = pose_losses(output, truth, options.loss)
+            if options.fine_tune:
+                heads = features.state
+                parts |= detector_losses(heads, targets_of(samples, heads.heat.shape[-2:], classes))
+            return parts
 
     def report(module: PoET, step: int) -> dict[str, float]:
-        return pose_figures(*predict(module, val, options.val_images, models), models)
+        detector = module.backbone[0]
+        assert isinstance(detector, SmallDetector)
+        found = validate_detector(detector, val, options.val_images, classes)
+        return found | pose_figures(*predict(module, val, options.val_images, models), models)
 
     return train_steps(network, losses, options.steps, report)
 

@@ -1,0 +1,155 @@
+"""A miniature of the embedded training: it learns, it resumes exactly, its losses mean what they say."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from scipy.spatial.transform import Rotation
+
+from poet_loc.data.packed import NO_CHANGE
+from poet_loc.data.render import RenderOptions, render
+from poet_loc.model.small_detector import SmallDetector, SmallDetectorOptions
+from poet_loc.train.detector import TrainDetectorOptions, batch_numbers, train_detector
+from poet_loc.train.embedded import (
+    EMBEDDED,
+    TrainEmbeddedOptions,
+    Truth,
+    half_sines,
+    pose_errors,
+    robust_likelihood,
+    train_embedded,
+)
+from poet_loc.train.steps import StepOptions, learning_rate_at
+
+TINY = SmallDetectorOptions(widths=(8, 16, 16, 16), blocks=(0, 1, 0, 0), pyramid_dim=12)
+TINY_CHANNELS = SmallDetector(TINY).shape().channels
+TINY_POET = replace(EMBEDDED, hidden_dim=32, heads=4, feedforward_dim=32, decoder_layers=2, map_channels=TINY_CHANNELS)
+
+
+@pytest.fixture(scope="module")
+def data(tmp_path_factory):
+    out = tmp_path_factory.mktemp("data")
+    settings = {"size": (96, 64), "jobs": 1, "progress": False, "images_per_scene": 6}
+    render(RenderOptions(out, images=6, **settings))
+    render(RenderOptions(out, split="val", images=6, first_scene=900000, **settings))
+    return out
+
+
+def steps(out, count: int, **changes) -> StepOptions:
+    settings = {"steps": count, "batch": 3, "warmup": 2, "save_every": 2, "precision": "float32", "learning_rate": 3e-3}
+    return StepOptions(out, **(settings | changes))
+
+
+def rows(folder) -> list[dict[str, float]]:
+    return [json.loads(line) for line in (folder / "log.jsonl").read_text().splitlines()]
+
+
+def test_the_detector_learns_a_handful_of_images_by_heart(data, tmp_path):
+    options = TrainDetectorOptions(data, data / "cache", steps(tmp_path, 24), TINY, NO_CHANGE)
+    train_detector(options)
+    first, last = rows(tmp_path)[0], rows(tmp_path)[-1]
+    assert last["heat"] < first["heat"]
+    assert last["sides"] < first["sides"]
+    assert {"precision", "recall", "val_point_error"} <= set(last)
+
+
+@pytest.mark.parametrize("fine_tune", [False, True])
+def test_an_interrupted_training_ends_as_an_uninterrupted_one(data, tmp_path, fine_tune):
+    def train(out, minutes: float):
+        torch.manual_seed(3)
+        options = TrainEmbeddedOptions(
+            data, data / "cache", steps(out, 4, minutes=minutes), TINY_POET, fine_tune=fine_tune, val_images=3
+        )
+        return train_embedded(options, SmallDetector(TINY))
+
+    whole = train(tmp_path / "whole", np.inf)
+    train_embedded_halfway(data, tmp_path / "halves", fine_tune)
+    resumed = train(tmp_path / "halves", np.inf)
+    for (name, a), b in zip(whole.state_dict().items(), resumed.state_dict().values()):
+        torch.testing.assert_close(a, b, msg=name)
+    assert rows(tmp_path / "halves")[-1]["step"] == 4
+
+
+def train_embedded_halfway(data, out, fine_tune: bool) -> None:
+    """Run the four-step schedule, but stop after the checkpoint of step two."""
+    from poet_loc.train import steps as module
+
+    torch.manual_seed(3)
+    options = TrainEmbeddedOptions(data, data / "cache", steps(out, 4), TINY_POET, fine_tune=fine_tune, val_images=3)
+    save, saved = module._save, []
+
+    def save_and_stop(*arguments):
+        save(*arguments)
+        saved.append(1)
+        raise KeyboardInterrupt
+
+    module._save = save_and_stop
+    try:
+        with pytest.raises(KeyboardInterrupt):
+            train_embedded(options, SmallDetector(TINY))
+    finally:
+        module._save = save
+    assert saved
+
+
+def test_a_frozen_detector_stays_as_it_is(data, tmp_path):
+    torch.manual_seed(0)
+    detector = SmallDetector(TINY)
+    before = {name: value.clone() for name, value in detector.state_dict().items()}
+    options = TrainEmbeddedOptions(data, data / "cache", steps(tmp_path, 2), TINY_POET, val_images=3)
+    trained = train_embedded(options, detector)
+    for name, value in trained.backbone[0].state_dict().items():
+        torch.testing.assert_close(value, before[name])
+    assert {"t_cm", "r_deg", "auc_add_s", "coverage_t"} <= set(rows(tmp_path)[-1])
+
+
+def test_a_pass_shows_every_image_once():
+    numbers = np.concatenate([batch_numbers(step, 4, 10, 0) for step in range(5)])
+    assert sorted(numbers[:10]) == sorted(numbers[10:]) == list(range(10))
+    assert list(numbers[:10]) != list(numbers[10:])
+
+
+def truth_of(R: np.ndarray, t: np.ndarray, axis=(0.0, 0.0, 0.0)) -> Truth:
+    count = len(R)
+    tensors = (torch.from_numpy(a).float() for a in (t, R, np.tile(axis, (count, 1)), np.ones((count, 2))))
+    return Truth(*tensors, torch.ones(count, dtype=torch.int64))
+
+
+def test_rotation_errors_are_angles_and_ignore_the_turn_of_symmetric_objects():
+    rng = np.random.default_rng(0)
+    R, t = Rotation.random(6, rng=rng).as_matrix(), rng.normal(size=(6, 3))
+    vectors = rng.normal(size=(6, 3))
+    errors = Rotation.from_rotvec(vectors)
+    found = torch.from_numpy(errors.as_matrix() @ R).float()
+    angles = errors.magnitude()
+    np.testing.assert_allclose(half_sines(found, truth_of(R, t)), np.sin(angles / 2), atol=1e-5)
+    e = pose_errors(torch.from_numpy(t + 0.01).float(), found, truth_of(R, t)).numpy()
+    np.testing.assert_allclose(e, np.concatenate([np.full((6, 3), 0.01), errors.as_rotvec()], 1), atol=2e-4)
+
+    turned = torch.from_numpy(R @ Rotation.from_euler("z", 1.3).as_matrix()).float()
+    symmetric = truth_of(R, t, (0.0, 0.0, 1.0))
+    np.testing.assert_allclose(half_sines(turned, symmetric), 0, atol=1e-6)
+    np.testing.assert_allclose(pose_errors(symmetric.t, turned, symmetric).numpy(), 0, atol=1e-3)
+    tilted = Rotation.from_euler("x", 0.2).as_matrix()
+    e = pose_errors(symmetric.t, torch.from_numpy(R @ tilted).float() @ torch.eye(3), symmetric)
+    np.testing.assert_allclose(e[:, 3:].norm(dim=1), 0.2, atol=1e-4)
+
+
+def test_the_likelihood_is_best_at_the_true_spread():
+    error = torch.from_numpy(np.random.default_rng(0).laplace(scale=0.02 / np.sqrt(2), size=(4000, 6))).float()
+    spreads = torch.tensor([0.01, 0.014, 0.02, 0.028, 0.04])
+    values = [float(robust_likelihood(error, (2 * sigma.log()).expand(4000, 6))) for sigma in spreads]
+    assert int(np.argmin(values)) == 2
+
+
+def test_the_learning_rate_rises_then_falls_to_its_share(tmp_path):
+    options = StepOptions(tmp_path, steps=100, warmup=10, learning_rate=1.0, final_share=0.01)
+    rates = [learning_rate_at(step, options) for step in range(101)]
+    assert rates[0] == pytest.approx(0.1)
+    assert max(rates) == pytest.approx(1.0)
+    assert rates[100] == pytest.approx(0.01)
+    assert np.all(np.diff(rates[10:]) < 0)
