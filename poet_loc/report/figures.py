@@ -256,7 +256,7 @@ def _totals(row: Row) -> tuple[Array, Array]:
 
 def _error_note(error: Array, sigma: Array) -> str:
     known = np.isfinite(sigma)
-    note = f"RMSE {statistics(error).rmse:.3g}"
+    note = f"RMSE {statistics(error).rmse:.2f}"
     return note + (f", {100 * np.mean(np.abs(error[known]) <= 3 * sigma[known]):.1f} % in 3σ" if known.any() else "")
 
 
@@ -266,7 +266,7 @@ def _robust_limits(panel: Axes, error: Array, bound: Array) -> str:
     limit = max(1.25 * max(np.percentile(np.abs(error), 98), usual_bound), 1e-6)
     panel.set_ylim(-limit, limit)
     beyond = np.count_nonzero(np.abs(error) > limit)
-    return f"; {beyond} frames beyond, up to {np.abs(error).max():.3g}" if beyond else ""
+    return f"; {beyond} frames beyond, up to {np.abs(error).max():.0f}" if beyond else ""
 
 
 def _draw_axes(axes: NDArray[Any], trajectory: Trajectory, start_ns: int, style: dict[str, Any]) -> None:

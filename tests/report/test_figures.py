@@ -75,7 +75,7 @@ def test_gross_errors_do_not_shrink_the_rest(run_record: RunRecord) -> None:
     errors[3, 0] = 50.0
     axes = error_figure(replace(row, errors=errors)).axes[0]
     assert axes.get_ylim()[1] < 200.0
-    assert "1 frames beyond, up to 5e+04" in axes.get_title("right")
+    assert "1 frames beyond, up to 50000" in axes.get_title("right")
 
 
 def test_lines_do_not_bridge_gaps() -> None:

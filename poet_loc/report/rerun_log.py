@@ -1,0 +1,379 @@
+"""A run as a rerun recording: the world with its paths, errors in their 3-sigma bands, biases, what the gate decided.
+
+Everything is sent by columns, never an entity a pose; long logs are thinned. The time is the sensor's.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import rerun as rr
+import rerun.blueprint as rrb
+from numpy.typing import NDArray
+from scipy.spatial.transform import RigidTransform, Rotation
+
+from poet_loc.core.records import Camera, LandmarkMap
+from poet_loc.core.trajectory import Trajectory
+from poet_loc.report.evaluate import ERROR_AXES, Body, Estimate, Row
+from poet_loc.report.fused import Fused
+from poet_loc.report.run_record import DECISIONS, Decisions, RunRecord
+
+Array = NDArray[np.float64]
+Stamps = NDArray[np.int64]
+Colour = tuple[int, int, int]
+
+TIMELINE = "sensor_time"
+MAX_ROWS = 20_000
+"""Longest column of one entity; longer ones are thinned evenly."""
+
+_TRUTH: Colour = (230, 230, 230)
+_ORACLE: Colour = (150, 150, 150)
+_PALETTE: tuple[Colour, ...] = (
+    (86, 180, 233),
+    (213, 94, 0),
+    (0, 158, 115),
+    (204, 121, 167),
+    (230, 159, 0),
+    (0, 114, 178),
+)  # Okabe and Ito (2008)
+_DECISION_COLOURS = (0xD55E00FF, 0xE69F00FF, 0xCC79A7FF, 0x0072B2FF)
+_NOT_SEEN = "not seen"
+_UNITS = ("mm", "mm", "mm", "deg", "deg", "deg")
+_EPOCH_NS = 10**17  # stamps beyond it (1973) count from 1970, stamps before it from the sensor's start
+
+
+def write_recording(record: RunRecord, path: str | Path, name: str = "poet-loc") -> None:
+    """Write a run to an .rrd file that `rerun` and `poet-loc view` open, with its layout in it.
+
+    Entities: world/landmarks, world/ground_truth/<body>, world/estimates/<estimate>, errors/<axis>/<estimate>,
+    states/<estimate>, consistency/<estimate>, decisions/<estimate>/<landmark>.
+    """
+    recording = rr.RecordingStream("poet-loc")
+    with recording:
+        recording.save(path, default_blueprint=_blueprint(record))
+        recording.send_recording_name(name)
+        recording.log("world", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
+        if record.landmark_map is not None and len(record.landmark_map):
+            _log_landmarks(recording, record, record.landmark_map)
+        for body, trajectory in record.references.items():
+            _log_trajectory(recording, record, f"world/ground_truth/{body}", trajectory, body, _TRUTH)
+        colours = _colours(record.estimates)
+        for estimate in record.estimates:
+            entity = f"world/estimates/{estimate.name}"
+            _log_trajectory(recording, record, entity, estimate.trajectory, estimate.body, colours[estimate.name])
+            _log_ellipsoids(recording, f"{entity}/position_3_sigma", estimate, colours[estimate.name])
+        for row in record.evaluation.rows if record.evaluation else ():
+            _log_errors(recording, row, colours.get(row.name, _ORACLE))
+        for fused in record.fused:
+            _log_states(recording, fused)
+        for estimator, decisions in record.decisions.items():
+            _log_decisions(recording, record, estimator, decisions)
+        _log_detections(recording, record)
+
+
+def _log_landmarks(recording: rr.RecordingStream, record: RunRecord, landmark_map: LandmarkMap) -> None:
+    T = landmark_map.T_world_obj
+    labels = [record.landmark_label(*landmark.key) for landmark in landmark_map]
+    boxes = rr.Boxes3D(
+        centers=T.translation,
+        half_sizes=[[0.02, 0.02, 0.02]] * len(labels),
+        quaternions=T.rotation.as_quat(),
+        labels=labels,
+        colors=_PALETTE[4],
+    )
+    recording.log("world/landmarks", boxes, static=True)
+    axes = 0.06 * T.rotation.as_matrix().mT.reshape(-1, 3)  # rows x, y, z of each landmark
+    origins, colours = np.repeat(T.translation, 3, axis=0), [[255, 0, 0], [0, 200, 0], [60, 60, 255]] * len(labels)
+    recording.log("world/landmarks/axes", rr.Arrows3D(origins=origins, vectors=axes, colors=colours), static=True)
+    known = [landmark for landmark in landmark_map if landmark.covariance is not None]
+    if known:
+        R = RigidTransform.concatenate([landmark.T_world_obj for landmark in known]).rotation.as_matrix()
+        covariances = R @ np.stack([landmark.covariance[3:, 3:] for landmark in known]) @ R.mT
+        half_sizes, q_xyzw = _ellipsoids(covariances)
+        centers = [landmark.T_world_obj.translation for landmark in known]
+        ellipsoids = rr.Ellipsoids3D(centers=centers, half_sizes=half_sizes, quaternions=q_xyzw, colors=_PALETTE[4])
+        recording.log("world/landmarks/position_3_sigma", ellipsoids, static=True)
+
+
+def _log_trajectory(
+    recording: rr.RecordingStream, record: RunRecord, entity: str, trajectory: Trajectory, body: Body, colour: Colour
+) -> None:
+    """The whole path at once, and the current pose with its camera."""
+    if len(trajectory) == 0:
+        return
+    trajectory = _thinned(trajectory)
+    path: rr.Points3D | rr.LineStrips3D
+    if entity.startswith("world/estimates/localize/"):  # single frames: lines between them would only tangle
+        points = trajectory.T_world_body.translation
+        path = rr.Points3D(points, colors=colour, radii=rr.Radius.ui_points(1.5))
+    else:
+        strips = [strip.T_world_body.translation for strip in _unbroken(trajectory)]
+        path = rr.LineStrips3D(strips, colors=colour, radii=rr.Radius.ui_points(1.0))
+    recording.log(f"{entity}/path", path, static=True)
+    pose = f"{entity}/pose"
+    T = trajectory.T_world_body
+    columns = rr.Transform3D.columns(translation=T.translation, quaternion=T.rotation.as_quat())
+    recording.send_columns(pose, [_time(trajectory.stamps_ns)], columns)
+    recording.log(pose, rr.TransformAxes3D(0.05), static=True)
+    if record.camera is not None and (body == "cam" or record.T_cam_imu is not None):
+        if body == "imu" and record.T_cam_imu is not None:
+            T_imu_cam = record.T_cam_imu.inv()
+            q_xyzw = rr.Quaternion(xyzw=T_imu_cam.rotation.as_quat())
+            mount = rr.Transform3D(translation=T_imu_cam.translation, quaternion=q_xyzw)
+            recording.log(f"{pose}/cam", mount, static=True)
+            pose = f"{pose}/cam"
+        recording.log(f"{pose}/view", _pinhole(record.camera, colour), static=True)
+
+
+def _log_ellipsoids(recording: rr.RecordingStream, entity: str, estimate: Estimate, colour: Colour) -> None:
+    """The 3-sigma ellipsoid of the position at each pose."""
+    if estimate.pose_covariances is None or len(estimate.trajectory) == 0:
+        return
+    step = _step(len(estimate.trajectory))
+    covariances = estimate.pose_covariances[::step, 3:, 3:]
+    known = np.flatnonzero(np.isfinite(covariances).all(axis=(1, 2)))
+    if len(known) == 0:
+        return
+    stamps_ns = estimate.trajectory.stamps_ns[::step][known]
+    half_sizes, q_xyzw = _ellipsoids(covariances[known])
+    columns = rr.Ellipsoids3D.columns(
+        centers=estimate.trajectory.T_world_body[::step][known].translation, half_sizes=half_sizes, quaternions=q_xyzw
+    )
+    recording.log(
+        entity,
+        rr.Ellipsoids3D.from_fields(colors=[colour], fill_mode=rr.components.FillMode.MajorWireframe),
+        static=True,
+    )
+    recording.send_columns(entity, [_time(stamps_ns)], columns)
+
+
+def _log_errors(recording: rr.RecordingStream, row: Row, colour: Colour) -> None:
+    """Each axis's error as a line, its 3-sigma as a band about zero, and the NEES."""
+    step = _step(len(row.stamps_ns))
+    time = _time(row.stamps_ns[::step])
+    for axis, unit, error in zip(ERROR_AXES, _UNITS, row.errors[::step].T, strict=True):
+        entity = f"errors/{axis}/{row.name}"
+        style = rr.SeriesLines(colors=colour, names=f"{row.name} [{unit}]", widths=1.5)
+        recording.log(entity, style, static=True)
+        recording.send_columns(entity, [time], rr.Scalars.columns(scalars=_in_unit(error, unit)))
+    if row.sigmas is not None:
+        # rerun draws one standard deviation: nine times the variance makes it three
+        bounds = 9.0 * row.sigmas[::step] ** 2
+        for axis, unit, bound in zip(ERROR_AXES, _UNITS, bounds.T, strict=True):
+            entity = f"errors/{axis}/{row.name}/3_sigma"
+            variances = _in_unit(_in_unit(bound, unit), unit)
+            name = f"±3σ [{unit}]"
+            _send_measurements(recording, entity, time, np.zeros((len(bound), 1)), variances[:, None], [name], [colour])
+    if row.nees is not None:
+        entity = f"consistency/{row.name}/nees_per_dof"
+        recording.log(entity, rr.SeriesLines(colors=colour, names=f"{row.name} NEES/dof [-]"), static=True)
+        recording.send_columns(entity, [time], rr.Scalars.columns(scalars=row.nees[::step]))
+
+
+def _log_states(recording: rr.RecordingStream, fused: Fused) -> None:
+    """Biases and velocity with their 3-sigma bands."""
+    step = _step(len(fused.stamps_ns))
+    time = _time(fused.stamps_ns[::step])
+    states = (
+        ("gyroscope_bias", fused.gyroscope_bias, slice(9, 12), "rad/s"),
+        ("accelerometer_bias", fused.accelerometer_bias, slice(12, 15), "m/s²"),
+        ("velocity", fused.velocity, slice(6, 9), "m/s"),
+    )
+    colours = [(213, 94, 0), (0, 158, 115), (0, 114, 178)]
+    for state, values, columns, unit in states:
+        names = [f"{state.replace('_', ' ')} {axis} ±3σ [{unit}]" for axis in "xyz"]
+        variances = 9.0 * fused.sigmas[::step, columns] ** 2
+        entity = f"states/{fused.name}/{state}"
+        _send_measurements(recording, entity, time, values[::step], variances, names, colours)
+    if fused.gate is not None:
+        step = _step(len(fused.gate.stamps_ns))
+        time = _time(fused.gate.stamps_ns[::step])
+        parts = (("position", fused.gate.nis_position, _PALETTE[0]), ("rotation", fused.gate.nis_rotation, _PALETTE[4]))
+        for part, nis, colour in parts:
+            entity = f"consistency/{fused.name}/nis_{part}_per_dof"
+            style = rr.SeriesPoints(names=f"{fused.name} NIS of {part}/dof [-]", colors=colour, marker_sizes=1.5)
+            recording.log(entity, style, static=True)
+            recording.send_columns(entity, [time], rr.Scalars.columns(scalars=nis[::step] / 3.0))
+
+
+def _log_decisions(recording: rr.RecordingStream, record: RunRecord, name: str, decisions: Decisions) -> None:
+    """A lane for each landmark, with a row wherever the decision changes."""
+    for key, (stamps_ns, decided) in decisions.lanes().items():
+        entity = f"decisions/{name}/{_path_part(record.landmark_label(*key))}"
+        states = [*DECISIONS, _NOT_SEEN]
+        colours = [*_DECISION_COLOURS, 0x80808030]
+        recording.log(entity, rr.StateConfiguration(values=states, labels=states, colors=colours), static=True)
+        at_ns, changed = _changes(stamps_ns, decided)
+        texts = [states[index] for index in changed]
+        recording.send_columns(entity, [_time(at_ns)], rr.StateChange.columns(state=texts))
+
+
+def _log_detections(recording: rr.RecordingStream, record: RunRecord) -> None:
+    """The detected objects as points in front of the true camera: how far they miss the landmarks is their error."""
+    detections = record.detections
+    if detections is None or len(detections) == 0 or "cam" not in record.references:
+        return
+    frames_ns = np.unique(detections.stamps_ns)
+    detections = detections[np.isin(detections.stamps_ns, frames_ns[:: _step(len(frames_ns))])]
+    stamps_ns, counts = np.unique(detections.stamps_ns, return_counts=True)  # sorted, as detections are
+    _, kinds = np.unique(detections.object_ids, return_inverse=True)
+    colours = np.array(_PALETTE)[kinds % len(_PALETTE)]
+    entity = "world/ground_truth/cam/pose/detections"
+    columns = rr.Points3D.columns(positions=detections.T_cam_obj.translation, colors=colours.astype(np.uint8))
+    recording.log(entity, rr.Points3D.from_fields(radii=rr.Radius.ui_points(3.0)), static=True)
+    recording.send_columns(entity, [_time(stamps_ns)], columns.partition(counts))
+
+
+def _blueprint(record: RunRecord) -> rrb.Blueprint:
+    names = [estimate.name for estimate in record.estimates]
+    shown = [name for name in names if not name.startswith("localize/") or name == "localize/robust"] or names
+    hidden = [name for name in names if name not in shown]
+    world = rrb.Spatial3DView(
+        origin="world",
+        name="world",
+        overrides={f"world/estimates/{name}": rrb.EntityBehavior(visible=False) for name in hidden},
+        line_grid=rrb.LineGrid3D(spacing=0.1),
+        eye_controls=_eye(record),
+    )
+    tabs: list[Any] = []
+    if record.evaluation is not None:
+        tabs += [
+            _error_views(ERROR_AXES[:3], "position error", hidden),
+            _error_views(ERROR_AXES[3:], "attitude error", hidden),
+        ]
+    for fused in record.fused:
+        states = ("gyroscope_bias", "accelerometer_bias", "velocity")
+        views = [rrb.TimeSeriesView(origin=f"states/{fused.name}/{state}", name=state) for state in states]
+        tabs.append(rrb.Vertical(*views, name=f"states of {fused.name}"))
+    consistent = {row.name for row in (record.evaluation.rows if record.evaluation else ()) if row.nees is not None}
+    consistent |= {fused.name for fused in record.fused if fused.gate is not None}
+    views = [
+        rrb.TimeSeriesView(origin=f"consistency/{name}", name=name, axis_y=rrb.ScalarAxis(range=(0.0, 8.0)))
+        for name in names
+        if name in consistent
+    ]
+    tabs += [rrb.Vertical(*views, name="consistency")] if views else []
+    lanes = [rrb.StateTimelineView(origin=f"decisions/{name}", name=f"seen by {name}") for name in record.decisions]
+    column = [rrb.Tabs(*tabs)] if tabs else []
+    column += [rrb.Tabs(*lanes[::-1])] if lanes else []
+    shares = [2, 1][: len(column)]
+    layout = rrb.Horizontal(world, rrb.Vertical(*column, row_shares=shares), column_shares=[3, 2]) if column else world
+    return rrb.Blueprint(layout, rrb.TimePanel(timeline=TIMELINE, expanded=False), collapse_panels=True)
+
+
+def _eye(record: RunRecord) -> rrb.EyeControls3D | None:
+    """Look down on landmarks and paths from aside."""
+    paths = [*record.references.values()] or [estimate.trajectory for estimate in record.estimates]
+    points = [np.asarray(path.T_world_body.translation) for path in paths if len(path)]
+    points += [landmark.T_world_obj.translation[None] for landmark in record.landmark_map or ()]
+    if not points:
+        return None
+    low, high = np.concatenate(points).min(axis=0), np.concatenate(points).max(axis=0)
+    centre, extent = (low + high) / 2, float(np.linalg.norm(high - low)) + 0.2
+    position = centre + extent * np.array([-0.55, -0.75, 0.6])
+    return rrb.EyeControls3D(position=position, look_target=centre, eye_up=(0.0, 0.0, 1.0))
+
+
+def _error_views(axes: Sequence[str], name: str, hidden: Iterable[str]) -> rrb.Vertical:
+    hide = list(hidden)
+    views = [
+        rrb.TimeSeriesView(
+            origin=f"errors/{axis}",
+            name=f"{axis} and ±3σ",
+            plot_legend=rrb.PlotLegend(corner=rrb.Corner2D.LeftTop, visible=axis == axes[0]),
+            overrides={f"errors/{axis}/{estimate}": rrb.EntityBehavior(visible=False) for estimate in hide},
+        )
+        for axis in axes
+    ]
+    return rrb.Vertical(*views, name=name)
+
+
+def _send_measurements(
+    recording: rr.RecordingStream,
+    entity: str,
+    time: rr.TimeColumn,
+    values: Array,
+    variances: Array,
+    names: Sequence[str],
+    colours: Sequence[Colour],
+) -> None:
+    """Columns (N, K) of K series."""
+    count = np.full(len(values), values.shape[1])
+    columns = rr.Measurements.columns(values=values.ravel(), variances=variances.ravel()).partition(count)
+    recording.log(entity, rr.Measurements.from_fields(names=names, colors=colours, widths=[1.5]), static=True)
+    recording.send_columns(entity, [time], columns)
+
+
+def _pinhole(camera: Camera, colour: Colour) -> rr.Pinhole:
+    fx, fy, cx, cy = camera.intrinsics
+    resolution = camera.resolution or (round(2 * cx), round(2 * cy))
+    return rr.Pinhole(
+        image_from_camera=np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]]),
+        resolution=resolution,
+        camera_xyz=rr.ViewCoordinates.RDF,
+        image_plane_distance=0.1,
+        color=colour,
+    )
+
+
+def _ellipsoids(covariances: Array) -> tuple[Array, Array]:
+    """3-sigma half axes (N, 3) and q_xyzw (N, 4) of covariances (N, 3, 3)."""
+    variances, axes = np.linalg.eigh(covariances)
+    axes[:, :, 2] *= np.sign(np.linalg.det(axes))[:, None]
+    return 3.0 * np.sqrt(np.maximum(variances, 0.0)), Rotation.from_matrix(axes).as_quat()
+
+
+def _changes(stamps_ns: Stamps, decided: NDArray[np.int64]) -> tuple[Stamps, NDArray[np.int64]]:
+    """Stamps and states (index into DECISIONS, or one beyond for not seen) wherever a lane changes."""
+    if len(stamps_ns) == 0:
+        return stamps_ns, decided
+    interval = int(np.median(np.diff(stamps_ns))) if len(stamps_ns) > 1 else 33_000_000
+    last_before_gap = np.append(np.diff(stamps_ns) > 1.6 * interval, True)
+    stamps = np.concatenate([stamps_ns, stamps_ns[last_before_gap] + interval])
+    states = np.concatenate([decided, np.full(last_before_gap.sum(), len(DECISIONS))])
+    order = np.argsort(stamps, kind="stable")
+    stamps, states = stamps[order], states[order]
+    keep = np.append(True, states[1:] != states[:-1])
+    return stamps[keep], states[keep]
+
+
+def _unbroken(trajectory: Trajectory) -> list[Trajectory]:
+    """The parts between gaps, so that no line bridges one."""
+    steps = np.diff(trajectory.stamps_ns)
+    if len(steps) < 2:
+        return [trajectory]
+    cuts = [0, *(np.flatnonzero(steps > 3 * np.median(steps)) + 1).tolist(), len(trajectory)]
+    return [trajectory[start:end] for start, end in itertools.pairwise(cuts)]
+
+
+def _thinned(trajectory: Trajectory) -> Trajectory:
+    return trajectory[:: _step(len(trajectory))]
+
+
+def _step(rows: int) -> int:
+    return 1 + (rows - 1) // MAX_ROWS if rows else 1
+
+
+def _time(stamps_ns: Stamps) -> rr.TimeColumn:
+    if len(stamps_ns) and stamps_ns[0] > _EPOCH_NS:
+        return rr.TimeColumn(TIMELINE, timestamp=stamps_ns.astype("datetime64[ns]"))
+    return rr.TimeColumn(TIMELINE, duration=stamps_ns.astype("timedelta64[ns]"))
+
+
+def _in_unit(values: Array, unit: str) -> Array:
+    return values * 1e3 if unit == "mm" else np.degrees(values)
+
+
+def _colours(estimates: Sequence[Estimate]) -> dict[str, Colour]:
+    rivals = [estimate.name for estimate in estimates if not estimate.oracle]
+    colours = {name: _PALETTE[k % len(_PALETTE)] for k, name in enumerate(rivals)}
+    return colours | {estimate.name: _ORACLE for estimate in estimates if estimate.oracle}
+
+
+def _path_part(text: str) -> str:
+    """A landmark's name as one part of an entity path."""
+    return "".join(c if c.isalnum() or c in "_-." else "_" for c in text)
