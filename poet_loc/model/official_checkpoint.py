@@ -219,12 +219,29 @@ def _plain(arguments: Mapping[str, Any]) -> dict[str, Any]:
     return {name: value if isinstance(value, simple) else str(value) for name, value in arguments.items()}
 
 
-def read_detector_weights(path: str | Path, class_count: int) -> YoloV4Csp:
-    """Return Scaled-YOLOv4-CSP with the weights of a .pt file (key `model`) or a Darknet binary."""
-    detector = YoloV4Csp(YoloOptions(class_count=class_count))
+def read_detector_weights(path: str | Path, options: YoloOptions | None = None) -> YoloV4Csp:
+    """Return Scaled-YOLOv4-CSP with the weights of a .pt file (key `model`) or a Darknet binary (.weights).
+
+    The number of classes is that of the file, unless options are given.
+    """
     if Path(path).suffix == ".weights":
+        detector = YoloV4Csp(options or YoloOptions(class_count=_darknet_classes(path)))
         detector.load_darknet(path)
         return detector
     weights, _, _ = read_official(path)
-    load_strictly(detector, {name.removeprefix("backbone.0."): w.float() for name, w in weights.items()}, path)
+    weights = {name.removeprefix("module.").removeprefix("backbone.0."): w.float() for name, w in weights.items()}
+    if "module_list.143.Conv2d.bias" not in weights:
+        raise InputError("holds no Scaled-YOLOv4-CSP", path=path)
+    detector = YoloV4Csp(options or YoloOptions(class_count=len(weights["module_list.143.Conv2d.bias"]) // 3 - 5))
+    load_strictly(detector, weights, path)
     return detector
+
+
+def _darknet_classes(path: str | Path) -> int:
+    """Return the number of classes that fits a Darknet file's length: each adds 3 (256 + 512 + 1024 + 3) weights."""
+    with torch.device("meta"):
+        one = YoloV4Csp(YoloOptions(class_count=1))
+    fixed = sum(tensor.numel() for name, tensor in one.state_dict().items() if "num_batches" not in name)
+    spare = (Path(path).stat().st_size - 20) // 4 - fixed
+    per_class = 3 * (256 + 512 + 1024 + 3)
+    return max(1 + round(spare / per_class), 1)
