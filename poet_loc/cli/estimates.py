@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, fields, replace
 from typing import Literal
 
 import numpy as np
@@ -81,20 +81,22 @@ def estimate_log(
     report: Report,
     modes: Sequence[Mode] = MODES,
     fusions: Sequence[Fusion] = FUSIONS,
+    strict: bool = False,
 ) -> Estimates:
     """Localise in these modes, fuse by these estimators, and evaluate; what the log lacks is noted and left out.
 
-    Raises InputError where nothing at all can be estimated.
+    Raises InputError where nothing at all can be estimated; if strict, for the first thing that cannot.
     """
     name = None
     if log.object_poses and log.landmark_map is not None:
         name = log.detections(detections)[0]
     elif detections is not None or log.camera_poses is None:
         log.detections(detections)
-    localized = tuple(_localized(log, name, options.solver, report, modes)) if name is not None else ()
-    fused = tuple(_fused(log, name, localized, options, report, fusions))
+    attempt = _Attempt(report, strict)
+    localized = tuple(_localized(log, name, options.solver, attempt, modes)) if name is not None else ()
+    fused = tuple(_fused(log, name, localized, options, attempt, fusions))
     if not localized and not fused:
-        raise InputError("nothing can be estimated", path=log.path, fix="see the lines above")
+        raise attempt.last or InputError("nothing can be estimated of this log", path=log.path)
     evaluation = evaluate_estimates(log, name, _estimates(log, localized, fused), options.evaluation, report)
     return Estimates(log, name, localized, fused, evaluation)
 
@@ -135,26 +137,43 @@ def evaluate_estimates(
     return evaluate(known, references, span_ns, options, frames_ns)
 
 
-def _localized(log: Log, detections: str | None, options: SolverOptions, report: Report, modes: Sequence[Mode]):  # type: ignore[no-untyped-def]
+@dataclass
+class _Attempt:
+    """What cannot be done is noted, or raised if strict."""
+
+    report: Report
+    strict: bool
+    last: InputError | None = None
+
+    def failed(self, error: InputError, consequence: str) -> None:
+        if self.strict:
+            raise error
+        self.last = error
+        self.report.note(f"{error}: {consequence}")
+
+
+def _localized(
+    log: Log, detections: str | None, options: SolverOptions, attempt: _Attempt, modes: Sequence[Mode]
+) -> Iterator[LocalizeResult]:
     for mode in modes:
-        report.step(f"localize {mode}")
-        if mode in ORACLES and log.T_world_cam is None:
-            report.note(f"{log.path}: no T_world_cam.tum: no localize/{mode}, which looks at the ground truth")
-            continue
-        yield localize(log, _localize_options(options, mode, detections))
+        attempt.report.step(f"localize {mode}")
+        try:
+            yield localize(log, _localize_options(options, mode, detections))
+        except InputError as error:
+            attempt.failed(error, f"no localize/{mode}")
 
 
-def _fused(  # type: ignore[no-untyped-def]
+def _fused(
     log: Log,
     detections: str | None,
     localized: Sequence[LocalizeResult],
     options: StageOptions,
-    report: Report,
+    attempt: _Attempt,
     fusions: Sequence[Fusion],
-):
+) -> Iterator[FuseResult]:
     lacking = _lacking_for_fusion(log)
     if lacking and fusions:
-        report.note(f"{log.path}: {lacking}: no fusion, localisation only")
+        attempt.failed(InputError(lacking, path=log.path), "localisation only")
         return
     from fusion.fuse import fuse
 
@@ -162,19 +181,17 @@ def _fused(  # type: ignore[no-untyped-def]
     camera_poses = camera_poses_to_fuse(log, solved)
     object_poses = None if detections is None else log.object_poses[detections]
     for estimator, measurements in fusions:
-        report.step(f"fuse {estimator} {measurements}")
-        if (camera_poses if measurements == "camera" else object_poses) is None:
-            continue
+        attempt.report.step(f"fuse {estimator} {measurements}")
         choice = replace(options.fusion, estimator=estimator, measurements=measurements)
         try:
             yield fuse(log, choice, camera_poses=camera_poses, object_poses=object_poses)
         except InputError as error:
-            report.note(f"{error}: no fuse/{estimator}/{measurements}")
+            attempt.failed(error, f"no fuse/{estimator}/{measurements}")
 
 
 def _localize_options(options: SolverOptions, mode: Mode, detections: str | None) -> LocalizeOptions:
-    values = {name: getattr(options, name) for name in SolverOptions.__dataclass_fields__}
-    return LocalizeOptions(**{**values, "mode": mode}, detections=detections)
+    values = {each.name: getattr(options, each.name) for each in fields(SolverOptions)}
+    return LocalizeOptions(**values | {"mode": mode}, detections=detections)
 
 
 def _lacking_for_fusion(log: Log) -> str:

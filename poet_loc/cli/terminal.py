@@ -31,6 +31,13 @@ class Quiet:
         print(line, file=sys.stderr)
 
 
+class Silent(Quiet):
+    """Nothing is said."""
+
+    def note(self, line: str) -> None:
+        """Say nothing."""
+
+
 class _Bar:
     def __init__(self, bar, task) -> None:  # type: ignore[no-untyped-def]
         self._bar, self._task, self._begun = bar, task, False

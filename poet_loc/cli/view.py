@@ -29,7 +29,8 @@ def execute(arguments: Arguments) -> None:
     recordings = [_recording(run) for run in arguments.runs]
     if not recordings:
         raise InputError("no run was named", fix="poet-loc view RUN")
-    place = ["--web-viewer", "--bind", "127.0.0.1"] if arguments.web else []
+    place = ["--bind", "127.0.0.1"]  # by itself the window, too, listens on every interface
+    place += ["--web-viewer"] if arguments.web else []
     status = subprocess.call([_program(), *place, *map(str, recordings)])
     if status:
         raise InputError(

@@ -1,0 +1,39 @@
+"""poet-loc demo: the embedded default from end to end."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+from fusion.simulate import SimulationOptions, simulate
+from poet_loc.cli.estimates import StageOptions
+from poet_loc.cli.run import run_stages, show
+from poet_loc.io.log_folder import write_log
+from poet_loc.io.whole_folder import whole_folder
+
+
+@dataclass(frozen=True)
+class Arguments:
+    """A simulated table-top log is written, localised, fused, evaluated, drawn and recorded; nothing is needed."""
+
+    out: Path = Path("demo")
+    """Folder that gets log/, which every other command reads, and run/."""
+    seed: int = 0
+    """Another seed is another world."""
+    pictures: bool = True
+    """Draw the figures and write the recording for rerun."""
+    overwrite: bool = False
+    """Replace a folder that has results."""
+    options: StageOptions = field(default_factory=StageOptions)
+
+
+def execute(arguments: Arguments) -> None:
+    """Simulate, run all stages, print the tables and name the files."""
+    with whole_folder(arguments.out, arguments.overwrite) as folder:
+        log = replace(simulate(SimulationOptions(seed=arguments.seed)), path=arguments.out / "log")
+        (folder / "log").mkdir()
+        write_log(folder / "log", log)
+        (folder / "run").mkdir()
+        estimates = run_stages(log, None, arguments.options, folder / "run", arguments, arguments.pictures)
+    show(estimates, arguments.out / "run")
+    print(f"\nThe log: {arguments.out / 'log'}\nLook at it: poet-loc view {arguments.out / 'run'}")

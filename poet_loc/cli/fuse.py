@@ -1,0 +1,50 @@
+"""poet-loc fuse: camera or object poses and a motion source become a trajectory."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from fusion.options import FuseOptions
+from landmarks.options import Mode, SolverOptions
+from poet_loc.cli.arguments import Flat, LogFolder
+from poet_loc.cli.estimates import StageOptions, estimate_log, steps
+from poet_loc.cli.run import show
+from poet_loc.cli.run_folder import WRITING_STEPS, write_run
+from poet_loc.cli.terminal import progress
+from poet_loc.io.log_folder import read_log
+from poet_loc.io.whole_folder import whole_folder
+
+
+@dataclass(frozen=True)
+class Arguments:
+    """Camera or object poses and an IMU become a trajectory with its sigmas, by one estimator."""
+
+    log: LogFolder
+    """The log folder."""
+    out: Path
+    """The run folder to write."""
+    detections: str | None = None
+    """NAME of object_poses_NAME.csv; without it object_poses.csv, or the only one there is."""
+    mode: Mode = "robust"
+    """Mode of the solver whose camera poses are fused by --measurements camera, if the log brings none of its own."""
+    options: Flat[FuseOptions] = field(default_factory=FuseOptions)
+    pictures: bool = True
+    """Draw the figures and write the recording for rerun."""
+    overwrite: bool = False
+    """Replace a run folder that has results."""
+
+
+def execute(arguments: Arguments) -> None:
+    """Fuse, print the table and name the files."""
+    options = arguments.options
+    stages = StageOptions(solver=SolverOptions(mode=arguments.mode), fusion=options)
+    with whole_folder(arguments.out, arguments.overwrite, inputs=[arguments.log]) as folder:
+        log = read_log(arguments.log, arguments.detections)
+        solve = options.measurements == "camera" and log.camera_poses is None
+        modes = (arguments.mode,) if solve else ()
+        fusions = ((options.estimator, options.measurements),)
+        with progress(steps(modes, fusions) + WRITING_STEPS) as report:
+            estimates = estimate_log(log, arguments.detections, stages, report, modes, fusions, strict=True)
+            write_run(folder, estimates, arguments, report, arguments.pictures)
+    show(estimates, arguments.out)

@@ -1,0 +1,143 @@
+"""What was made of a log, as the files of a run folder."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Iterator
+from dataclasses import fields, is_dataclass
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+
+from fusion.result import FuseResult
+from landmarks.localize import LocalizeResult
+from poet_loc.cli.estimates import Estimates
+from poet_loc.cli.terminal import Report
+from poet_loc.io.camera_poses_csv import write_camera_poses
+from poet_loc.io.number_table import write_csv
+from poet_loc.io.tum import write_tum
+from poet_loc.io.whole_folder import write_whole_file
+from poet_loc.report.error_tables import Block, table_text
+from poet_loc.report.summary import to_summary, write_errors_csv, write_summary
+
+WRITING_STEPS = 3
+
+_AT_THE_TOP = ("localize/robust", "fuse/eskf/objects")
+"""Whose trajectories stand at the top of the folder, where they are among the estimates."""
+
+_PACKAGES = ("poet-loc", "numpy", "scipy", "numba", "gtsam", "rerun-sdk", "matplotlib")
+
+
+def write_run(folder: Path, estimates: Estimates, asked: Any, report: Report, pictures: bool = True) -> None:
+    """Write a run into an existing folder: trajectories, states, errors, tables, options, and pictures if asked for.
+
+    asked is the dataclass of the command's arguments; options.yaml tells it with the versions.
+    """
+    report.step("write trajectories")
+    for localized in estimates.localized:
+        for place in _places(folder, localized.name, len(estimates.localized)):
+            write_localized(place, localized)
+    for fused in estimates.fused:
+        for place in _places(folder, fused.name, len(estimates.fused)):
+            write_fused(place, fused)
+    if estimates.evaluation is not None:
+        summary = to_summary(estimates.evaluation)
+        write_summary(folder / "summary.json", summary)
+        write_errors_csv(folder / "errors.csv", estimates.evaluation)
+        write_whole_file(folder / "table.md", [table_text([Block(summary)], "md")])
+        write_whole_file(folder / "table.tex", [table_text([Block(summary)], "latex")])
+    write_whole_file(folder / "options.yaml", [options_text(asked)])
+    if pictures:
+        _write_pictures(folder, estimates, report)
+
+
+def write_localized(folder: Path, result: LocalizeResult) -> None:
+    """Write camera_poses.csv, with who voted, and T_world_cam.tum."""
+    write_camera_poses(folder / "camera_poses.csv", result.estimates.camera_poses, result.voter_columns)
+    write_tum(folder / "T_world_cam.tum", result.trajectory)
+
+
+def write_fused(folder: Path, result: FuseResult) -> None:
+    """Write T_world_imu.tum and states.csv: m, m/s, rad/s, m/s^2; attitude sigmas in rad about the imu's axes."""
+    write_tum(folder / "T_world_imu.tum", result.trajectory)
+    T = result.T_world_imu
+    blocks = {
+        "position": ("px", "py", "pz"),
+        "velocity": ("vx", "vy", "vz"),
+        "quaternion": ("qx", "qy", "qz", "qw"),
+        "gyroscope_bias": ("bgx", "bgy", "bgz"),
+        "accelerometer_bias": ("bax", "bay", "baz"),
+    }
+    sigmas = ("rx", "ry", "rz", *blocks["position"], *blocks["velocity"])
+    sigmas += (*blocks["gyroscope_bias"], *blocks["accelerometer_bias"])
+    header = ["timestamp_ns", *(name for names in blocks.values() for name in names), *(f"sigma_{s}" for s in sigmas)]
+    columns = np.hstack(
+        [
+            T.translation,
+            result.velocity,
+            T.rotation.as_quat(),
+            result.gyroscope_bias,
+            result.accelerometer_bias,
+            result.sigmas,
+        ]
+    )
+    write_csv(folder / "states.csv", header, [result.stamps_ns, *columns.round(9).T])
+
+
+def options_text(asked: Any) -> str:
+    """Return options.yaml: what was asked, and the versions that did it."""
+    content = {"command": type(asked).__module__.rpartition(".")[2], "asked": _plain(asked), "versions": _versions()}
+    return yaml.safe_dump(content, sort_keys=False, allow_unicode=True)
+
+
+def named_files(out: Path) -> list[str]:
+    """Return the files at the top of a run folder, and its folders with the number of files in them."""
+    lines = [str(path) for path in sorted(out.iterdir()) if path.is_file()]
+    for path in sorted(out.iterdir()):
+        if path.is_dir():
+            lines.append(f"{path}/ ({sum(each.is_file() for each in path.rglob('*'))} files)")
+    return lines
+
+
+def _places(folder: Path, name: str, rivals: int) -> Iterator[Path]:
+    """Yield the folders that an estimate is written to; one estimate alone stands at the top only."""
+    if rivals == 1 or name in _AT_THE_TOP:
+        yield folder
+    if rivals > 1:
+        place = folder / name
+        place.mkdir(parents=True)
+        yield place
+
+
+def _write_pictures(folder: Path, estimates: Estimates, report: Report) -> None:
+    record = estimates.record
+    report.step("draw figures")
+    from poet_loc.report.figures import write_figures
+
+    write_figures(record, folder / "figures")
+    report.step("record for rerun")
+    from poet_loc.report.rerun_log import write_recording
+
+    write_recording(record, folder / "recording.rrd")
+
+
+def _plain(value: Any) -> Any:
+    """Return options as what YAML knows."""
+    if is_dataclass(value) and not isinstance(value, type):
+        return {each.name: _plain(getattr(value, each.name)) for each in fields(value)}
+    if isinstance(value, tuple | list):
+        return [_plain(each) for each in value]
+    return str(value) if isinstance(value, Path) else value
+
+
+def _versions() -> dict[str, str]:
+    found = {"python": sys.version.split()[0]}
+    for name in _PACKAGES:
+        try:
+            found[name] = version(name)
+        except PackageNotFoundError:
+            continue
+    return found
