@@ -170,8 +170,8 @@ def _by_image(path: Path) -> dict[int, Any]:
     if not isinstance(content, dict) or not content:
         raise InputError("has no images", path=path, fix=_FIX)
     try:
-        return {int(image): entry for image, entry in content.items()}
-    except ValueError:
+        return {int(np.int64(int(image))): entry for image, entry in content.items()}
+    except (ValueError, OverflowError):
         raise InputError("has a key that is no image number", path=path, fix=_FIX) from None
 
 

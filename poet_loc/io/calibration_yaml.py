@@ -137,15 +137,24 @@ def _camera(chain: Mapping[str, Any]) -> Camera | None:
     model = chain.get("distortion_model", "none")
     if model not in _COEFFICIENTS:
         raise FieldError(f"distortion_model is {model!r}: {', '.join(_COEFFICIENTS)} are known here")
-    coefficients = np.ravel(_matrix(chain.get("distortion_coeffs", [])))
+    coefficients = _coefficients(chain.get("distortion_coeffs") or [])
     if len(coefficients) not in _COEFFICIENTS[model] and (len(coefficients) or model != "none"):
         raise FieldError(f"distortion_coeffs has {len(coefficients)} values, {model} needs {_COEFFICIENTS[model][0]}")
     return Camera(
         (fx, fy, cx, cy),
         model,
-        tuple(numbers(coefficients, "distortion_coeffs", (len(coefficients),)).tolist()),
+        tuple(coefficients),
         _resolution(chain.get("resolution")),
     )
+
+
+def _coefficients(value: Any) -> list[float]:
+    values = _matrix(value)
+    if isinstance(values, np.ndarray):
+        values = values.ravel().tolist()
+    if not isinstance(values, list):
+        raise FieldError(f"distortion_coeffs is {values!r}, no list")
+    return [number(each, "distortion_coeffs") for each in values]
 
 
 def _resolution(value: Any) -> tuple[int, int] | None:

@@ -28,9 +28,9 @@ def required(fields: Mapping[str, Any], name: str) -> Any:
 
 
 def whole_number(value: Any, name: str) -> int:
-    """Return an integer.  Raises FieldError for anything else."""
-    if isinstance(value, bool) or not isinstance(value, int):
-        raise FieldError(f"{name} is {value!r}, no whole number")
+    """Return an integer of 64 bits.  Raises FieldError for anything else."""
+    if isinstance(value, bool) or not isinstance(value, int) or not -(2**63) <= value < 2**63:
+        raise FieldError(f"{name} is {value!r}, no whole number of 64 bits")
     return value
 
 

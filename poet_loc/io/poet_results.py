@@ -142,7 +142,7 @@ def _in_order(detections: Any) -> list[Mapping[str, Any]]:
 
 
 def _rotation(value: Any) -> Rotation:
-    if np.shape(value) == (4,):
+    if isinstance(value, list) and len(value) == 4:
         w, x, y, z = numbers(value, "rot", (4,))
         return unit_quaternion([x, y, z, w], "rot")
     matrix = numbers(value, "rot", (3, 3))

@@ -106,6 +106,7 @@ BAD = {
         ("", None, "empty"),
         ("{}", None, "no images"),
         ('{"one": {}}', None, "no image number"),
+        ('{"99999999999999999999": {}}', None, "no image number"),
         ('{\n"1": []}', 2, "image 1: holds no camera"),
         (edited(CAMERA, "36", cam_K=[1, 2, 3]), 3, "image 36: cam_K has the shape (3,)"),
         (edited(CAMERA, "36", cam_t_w2c=[1, float("nan"), 3]), 3, "image 36: cam_t_w2c is NaN"),

@@ -158,6 +158,8 @@ BAD = {
     "no focal length": (GOLDEN.replace("458.654", "0"), 9, "positive focal lengths"),
     "camera model": (GOLDEN.replace("pinhole", "omni"), 8, "only pinhole"),
     "distortion model": (GOLDEN.replace("radtan", "fisheye"), 10, "distortion_model is 'fisheye'"),
+    "distortion ragged": (GOLDEN.replace("-0.28,", "[-0.28, 1],"), 11, "distortion_coeffs has the shape (2,)"),
+    "distortion a number": (GOLDEN.replace("[-0.28, 0.07, 1e-4, 2e-05]", "3"), 11, "distortion_coeffs is 3, no list"),
     "distortion count": (GOLDEN.replace("-0.28, ", ""), 11, "distortion_coeffs has 3 values"),
     "resolution": (GOLDEN.replace("[752, 480]", "[752.5, 480]"), 12, "resolution is [752.5, 480]"),
 }

@@ -93,6 +93,7 @@ BAD = {
     "missing": (changed(q_xyzw="left out"), "q_xyzw is missing"),
     "unknown": (changed(q_wxyz=[1, 0, 0, 0]), "unknown field 'q_wxyz'"),
     "id no number": (changed(object_id="bowl"), "object_id is 'bowl'"),
+    "id beyond int64": (changed(object_id=2**63), "no whole number of 64 bits"),
     "id a fraction": (changed(object_id=1.5), "object_id is 1.5"),
     "t too short": (changed(t=[1, 2]), "t has the shape (2,)"),
     "t of text": (changed(t=["a", 1, 2]), "t holds something that is no number"),

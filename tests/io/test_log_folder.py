@@ -160,6 +160,8 @@ def test_shared_logs(shared_data, tmp_path):
         assert log.landmark_map is not None
         assert log.T_world_imu is not None
         assert log.calibration.T_cam_imu is not None
+        if folder.name not in {"0029", "0053", "euroc_v101"}:
+            continue
         (tmp_path / folder.name).mkdir()
         write_log(tmp_path / folder.name, log)
         again = read_log(tmp_path / folder.name)

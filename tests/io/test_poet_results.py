@@ -109,6 +109,11 @@ def test_images_without_a_stamp_or_with_two(write):
         ("{}", None, "no images"),
         ('{"1": {}}', None, "no detections"),
         ('{"1": [1]}', 1, "image 1: holds no detections by number"),
+        (
+            GOLDEN.replace("[0.8, 0.6, 0, 0]", "[[1, 0, 0], [0, 1], [0, 0, 1]]"),
+            1,
+            "rot holds something",
+        ),
         (GOLDEN.replace('"class": 1', '"class": "cup"'), 5, "image b_3: class is 'cup'"),
         (GOLDEN.replace('"t": [0, 0, 2], ', ""), 5, "image b_3: t is missing"),
         (GOLDEN.replace("[0, 0, 2]", "[0, 0, NaN]"), 5, "image b_3: t is NaN"),
