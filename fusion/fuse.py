@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Callable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -42,8 +43,13 @@ def fuse(
     return run_graph(problem, options)
 
 
-def run_filter(problem: Problem, options: FuseOptions) -> FuseResult:
-    """Run the error-state Kalman filter over a whole log."""
+def run_filter(
+    problem: Problem, options: FuseOptions, loop: Callable[..., int] = filter_loop.run_log, estimator: str = "eskf"
+) -> FuseResult:
+    """Run the error-state Kalman filter over a whole log.
+
+    loop: `filter_loop.run_log`, or its plain twin in `fusion/reference_filter.py`.
+    """
     began = time.perf_counter()
     floats, integers = fill_memory(problem, options)
     measured, imu = problem.measurements, problem.imu
@@ -52,7 +58,7 @@ def run_filter(problem: Problem, options: FuseOptions) -> FuseResult:
     stamps, core = np.zeros(rows, dtype=np.int64), np.zeros((rows, filter_loop.OUT_CORE))
     sigma, covariance = np.zeros((rows, filter_loop.OUT_SIGMA)), np.zeros((rows, filter_loop.OUT_COVARIANCE))
     columns = (measured.kinds, measured.objects, measured.rotations, measured.translations, measured.covariances)
-    written = filter_loop.run_log(
+    written = loop(
         floats,
         integers,
         imu.stamps_ns,
@@ -75,7 +81,7 @@ def run_filter(problem: Problem, options: FuseOptions) -> FuseResult:
         )
     counters = memory.views.py_func(floats, integers).counters
     return result_from_rows(
-        f"fuse/eskf/{options.measurements}",
+        f"fuse/{estimator}/{options.measurements}",
         (stamps[:written], core[:written], sigma[:written], covariance[:written].reshape(-1, 6, 6)),
         gate_log(problem, decisions, nis),
         time.perf_counter() - began,

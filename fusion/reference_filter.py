@@ -1,0 +1,218 @@
+"""The filter of `fusion/filter_loop.py` once more, in plain numpy on filterpy's linear predict and update.
+
+Written to be read and to hold the compiled filter against, not to be fast; the matrices are in
+`fusion/reference_models.py`. What is no linear algebra (where to start, when to start again, which bias has jumped) is
+asked of the compiled filter's own functions.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from filterpy.kalman import predict, update
+
+from fusion import filter_loop, imu, memory
+from fusion.eskf import ACCEPTED, BIAS_MODEL_SIZE, BIAS_TAU, POSITION_ONLY, REJECTED, ROTATION_ONLY, bias_sigma
+from fusion.fuse import run_filter
+from fusion.measurements import OBJECT_POSE
+from fusion.nav_state import (
+    EXTRINSIC_ROTATION,
+    GYRO_BIAS,
+    OBJECT_SIZE,
+    OBJECTS,
+    TIME_OFFSET,
+    Array,
+    Ints,
+    retract_state,
+)
+from fusion.options import FuseOptions
+from fusion.prepare import Problem
+from fusion.reference_models import (
+    BOTH,
+    POSITION_ROWS,
+    ROTATION_ROWS,
+    exp,
+    layout_from_integers,
+    nearest_symmetric,
+    process_noise,
+    residual_and_jacobian,
+    transition,
+    transport,
+)
+from fusion.result import FuseResult
+
+Columns = tuple[Ints, Ints, Array, Array, Array]
+"""kinds (M,), objects (M,), rotations (M, 9), translations (M, 3), covariances (M, 6, 6)"""
+
+
+def run_reference(problem: Problem, options: FuseOptions) -> FuseResult:
+    """Run the plain filter over a whole log: the same numbers as `fuse.run_filter`, some hundred times slower."""
+    return run_filter(problem, options, loop=run_log, estimator="reference")
+
+
+class ReferenceFilter:
+    """State and covariance of a filter's memory, moved by dense matrices."""
+
+    def __init__(self, floats: Array, integers: Ints) -> None:
+        self.m = memory.views.py_func(floats, integers)
+        self.layout = layout_from_integers(self.m.layout)
+        self.work = memory.work_views.py_func(self.m.work, self.layout.n_error)
+        self.zero = np.zeros(self.layout.n_error)
+
+    @property
+    def tracking(self) -> bool:
+        """Whether the start is past."""
+        return bool(self.m.counters[memory.MODE] == memory.TRACKING)
+
+    def advance(self, imu_stamps: Ints, imu_values: Array, until: int) -> None:
+        """Integrate the IMU, linear in time between samples, up to a stamp."""
+        c = self.m.counters
+        while c[memory.NOW] < until:
+            k, now = c[memory.IMU_AT], c[memory.NOW]
+            stop = min(imu_stamps[k + 1], until)
+            middle = 0.5 * ((now - imu_stamps[k]) + (stop - imu_stamps[k]))
+            share = middle / (imu_stamps[k + 1] - imu_stamps[k])
+            self._step((stop - now) * 1e-9, imu_values[k] + share * (imu_values[k + 1] - imu_values[k]))
+            c[memory.NOW] = stop
+            c[memory.IMU_AT] += stop == imu_stamps[k + 1]
+
+    def _step(self, dt: float, values: Array) -> None:
+        m = self.m
+        if not self.tracking:  # no covariance yet; the compiled step also keeps the mean specific force
+            imu.propagate_nominal(m.x, dt, values[:3].copy(), values[3:].copy(), self.work.step)
+            filter_loop._watch_gravity(m, self.work, dt)
+            return
+        m.x[:], F = transition(m.x, dt, values[:3], values[3:], self.layout)
+        _, m.P[:] = predict(self.zero, m.P, F, process_noise(self.layout.n_error, dt, m.noise))
+
+    def decay_biases(self) -> None:
+        """Let the object biases relax since the last measurement: Gauss-Markov, x <- phi x, P <- Phi P Phi + Q."""
+        m, c, layout = self.m, self.m.counters, self.layout
+        seconds = (c[memory.NOW] - c[memory.BIAS_TIME]) * 1e-9
+        c[memory.BIAS_TIME] = c[memory.NOW]
+        if not layout.bias_kinds:
+            return
+        Phi, Q = np.eye(layout.n_error), np.zeros((layout.n_error, layout.n_error))
+        for kind in range(layout.bias_kinds):
+            phi = math.exp(-seconds / m.bias_model[kind * BIAS_MODEL_SIZE + BIAS_TAU])
+            sigma = np.array([bias_sigma(m.bias_model, kind, i) for i in range(6)])
+            for k in range(layout.n_objects):
+                part = layout.error_slice("biases", k, kind)
+                m.x[layout.nominal_bias(k, kind)] *= phi
+                Phi[part, part] = phi * np.eye(6)
+                Q[part, part] = np.diag((1.0 - phi**2) * sigma**2)
+        _, m.P[:] = predict(self.zero, m.P, Phi, Q)
+
+    def gate(self, residual: Array, S: Array, nis: Array) -> int:
+        """Decide what of a measurement to use; write its NIS [both, rotation, position] into nis (3,)."""
+        limits = self.m.limits
+        for i, rows in enumerate((BOTH, ROTATION_ROWS, POSITION_ROWS)):
+            nis[i] = residual[rows] @ np.linalg.solve(S[rows, rows], residual[rows])
+        if nis[0] <= limits[filter_loop.LIMIT_BOTH]:
+            return ACCEPTED
+        if limits[filter_loop.PARTIAL] >= 1 and nis[2] <= limits[filter_loop.LIMIT_POSITION]:
+            return POSITION_ONLY
+        if limits[filter_loop.PARTIAL] >= 2 and nis[1] <= limits[filter_loop.LIMIT_ROTATION]:
+            return ROTATION_ONLY
+        return REJECTED
+
+    def take(self, measured: Columns, j: int, rate: Array, nis: Array) -> int:
+        """Gate measurement j, which is at the filter's stamp, correct with what passes, and return what that was."""
+        kinds, objects, rotations, translations, covariances = measured
+        kind, k, t_m = int(kinds[j]), int(objects[j]), translations[j]
+        m, R_m, R = self.m, rotations[j].reshape(3, 3), covariances[j]
+        if kind == OBJECT_POSE:
+            R = R * m.scales[k]
+            if m.orders[k] != 1:
+                R_m, R = self._fit_symmetry(k, R_m, R, rate)
+        offset = m.limits[filter_loop.NOMINAL_OFFSET]
+        residual, H = residual_and_jacobian(kind, k, R_m, t_m, m.x, rate, offset, self.layout)
+        decision = self.gate(residual, H @ m.P @ H.T + R, nis)
+        if kind == OBJECT_POSE and m.limits[filter_loop.ADAPTATION] > 0.0:
+            filter_loop._adapt_scale(m, k, nis[0])
+        if decision != REJECTED:
+            rows = {ACCEPTED: BOTH, POSITION_ONLY: POSITION_ROWS, ROTATION_ONLY: ROTATION_ROWS}[decision]
+            self.correct(residual[rows], H[rows], R[rows, rows])
+        return decision
+
+    def correct(self, residual: Array, H: Array, R: Array) -> None:
+        """Update the error state from zero, move the nominal state by it, and carry the covariance along."""
+        m, before = self.m, self.m.x.copy()
+        error, P = update(self.zero, m.P, residual, R, H)
+        m.x[:] = retract_state(before, error, self.layout)
+        G = transport(before, m.x, error, self.layout)
+        m.P[:] = G @ P @ G.T
+
+    def _fit_symmetry(self, k: int, R_m: Array, R: Array, rate: Array) -> tuple[Array, Array]:
+        """Turn a measured rotation to the look-alike that fits best; a continuous symmetry says nothing of its turn."""
+        x, axis, order = self.m.x, self.m.axes[k], int(self.m.orders[k])
+        seconds = x[TIME_OFFSET] - self.m.limits[filter_loop.NOMINAL_OFFSET]
+        R_ic = x[EXTRINSIC_ROTATION : EXTRINSIC_ROTATION + 9].reshape(3, 3)
+        at = OBJECTS + OBJECT_SIZE * k
+        R_co = (x[:9].reshape(3, 3) @ exp(seconds * rate) @ R_ic).T @ x[at : at + 9].reshape(3, 3)
+        R_m = nearest_symmetric(R_m, R_co, axis, order)
+        if order == 0:
+            R = R.copy()
+            R[:3, :3] += 1e3 * np.outer(R_m @ axis, R_m @ axis)
+        return R_m, R
+
+    def measure(self, first: int, last: int, measured: Columns, rate: Array, decisions: Ints, nis: Array) -> None:
+        """Take in all measurements of one stamp, then see whether to start or to start again."""
+        m, c, (kinds, objects, rotations, translations, _) = self.m, self.m.counters, measured
+        decisions[first:last] = REJECTED
+        if self.tracking:
+            self.decay_biases()
+            for _ in range(2):  # what was refused before the others moved the state, again
+                for j in range(first, last):
+                    if decisions[j] == REJECTED:
+                        decisions[j] = self.take(measured, j, rate, nis[j])
+                if not decisions[first:last].any():
+                    break
+        for j in range(first, last):
+            filter_loop._follow_jumps(m, kinds[j], objects[j], decisions[j])
+            filter_loop._vote(m, self.work, kinds[j], objects[j], rotations[j], translations[j], decisions[j])
+        if decisions[first:last].any():
+            c[memory.LAST_UPDATE] = c[memory.NOW]
+        if self.tracking:
+            filter_loop._restart_if_lost(m, self.work)
+        else:
+            filter_loop._try_to_start(m, self.work)
+
+
+def run_log(
+    floats: Array,
+    integers: Ints,
+    imu_stamps: Ints,
+    imu_values: Array,
+    stamps: Ints,
+    kinds: Ints,
+    objects: Ints,
+    rotations: Array,
+    translations: Array,
+    covariances: Array,
+    decisions: Ints,
+    nis: Array,
+    out_stamps: Ints,
+    out_core: Array,
+    out_sigma: Array,
+    out_covariance: Array,
+) -> int:
+    """Filter a whole log: `filter_loop.run_log` with the same arguments and the same rows."""
+    f = ReferenceFilter(floats, integers)
+    measured = (kinds, objects, rotations, translations, covariances)
+    filter_loop.begin(f.m, imu_stamps[0], imu_values[0, 3:6].copy(), 0)
+    span = (stamps >= imu_stamps[0]) & (stamps <= imu_stamps[-1])
+    rows = 0
+    for stamp in np.union1d(imu_stamps, stamps[span]):
+        f.advance(imu_stamps, imu_values, stamp)
+        first, last = np.searchsorted(stamps, [stamp, stamp + 1])
+        if last > first:
+            gyro = [np.interp(stamp - imu_stamps[0], imu_stamps - imu_stamps[0], imu_values[:, i]) for i in range(3)]
+            f.measure(first, last, measured, np.array(gyro) - f.m.x[GYRO_BIAS : GYRO_BIAS + 3], decisions, nis)
+        if f.tracking:
+            out_stamps[rows], out_core[rows] = stamp, f.m.x[: filter_loop.OUT_CORE]
+            out_sigma[rows] = np.sqrt(np.diag(f.m.P)[: filter_loop.OUT_SIGMA].clip(min=0.0))
+            out_covariance[rows] = f.m.P[:6, :6].ravel()
+            rows += 1
+    return rows

@@ -1,0 +1,80 @@
+"""Short problems for the tests of the filters, and a run of either filter with everything it writes."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from fusion import memory
+from fusion.nav_state import StateLayout
+from fusion.options import FuseOptions
+from fusion.prepare import Problem, fill_memory, pose_problem
+from fusion.simulate import SimulationOptions, simulate
+
+LAYOUTS = {
+    "no biases": StateLayout(n_objects=3),
+    "one bias": StateLayout(n_objects=3, bias_kinds=1),
+    "extrinsics and gravity": StateLayout(n_objects=3, extrinsics=True, gravity=True, bias_kinds=1),
+    "time offset": StateLayout(n_objects=3, time_offset=True),
+    "objects": StateLayout(n_objects=3, objects=True),
+    "everything": StateLayout(n_objects=3, extrinsics=True, time_offset=True, gravity=True, objects=True, bias_kinds=2),
+}
+
+
+@dataclass(frozen=True)
+class FilterRun:
+    """What a loop over a whole log wrote, and the memory it left."""
+
+    decisions: np.ndarray
+    nis: np.ndarray
+    stamps: np.ndarray
+    core: np.ndarray
+    sigma: np.ndarray
+    covariance: np.ndarray
+    memory: memory.Memory
+
+
+def simulated(measurements: str = "objects", layout: StateLayout | None = None, **simulation) -> Problem:
+    """Return a problem of six seconds at low rates: three objects, one of them a can."""
+    wanted = {"duration_s": 6.0, "imu_rate_hz": 100.0, "camera_rate_hz": 15.0, "objects": 3, "symmetric_objects": 1}
+    log = simulate(SimulationOptions(**(wanted | {"camera_poses": measurements == "camera"} | simulation)))
+    problem = pose_problem(log, FuseOptions(measurements=measurements))
+    return problem if layout is None else replace(problem, layout=layout)
+
+
+def memory_of(problem: Problem, options: FuseOptions) -> tuple[np.ndarray, np.ndarray]:
+    """Return the filled memory, with a prior on everything that is switched on."""
+    floats, integers = fill_memory(problem, options)
+    m = memory.views.py_func(floats, integers)
+    m.prior[m.prior == 0.0] = 0.02
+    return floats, integers
+
+
+def run(loop: Callable[..., int], problem: Problem, options: FuseOptions) -> FilterRun:
+    """Run `filter_loop.run_log` or its plain twin."""
+    floats, integers = memory_of(problem, options)
+    measured, imu = problem.measurements, problem.imu
+    count, rows = len(measured), len(imu) + len(measured)
+    out = [np.zeros(count, np.int64), np.full((count, 3), np.nan), np.zeros(rows, np.int64)]
+    out += [np.zeros((rows, 21)), np.zeros((rows, 15)), np.zeros((rows, 36))]
+    columns = (measured.kinds, measured.objects, measured.rotations, measured.translations, measured.covariances)
+    values = np.hstack([imu.angular_velocity, imu.specific_force])
+    written = loop(floats, integers, imu.stamps_ns, values, measured.stamps_ns, *columns, *out)
+    return FilterRun(*out[:2], *(column[:written] for column in out[2:]), memory.views.py_func(floats, integers))
+
+
+def assert_same(one: FilterRun, other: FilterRun, tolerance: float = 1e-9) -> None:
+    """Hold every number of two runs together: states against 1, covariances against their own size."""
+    np.testing.assert_array_equal(one.decisions, other.decisions)
+    np.testing.assert_array_equal(one.stamps, other.stamps)
+    np.testing.assert_allclose(one.nis, other.nis, rtol=1e-7)  # quotients of small numbers
+    np.testing.assert_allclose(one.core, other.core, rtol=tolerance, atol=tolerance)
+    np.testing.assert_allclose(one.sigma, other.sigma, rtol=tolerance)
+    np.testing.assert_allclose(one.memory.x, other.memory.x, rtol=tolerance, atol=tolerance)
+    for P, Q in ((one.memory.P, other.memory.P), *zip(*(r.covariance.reshape(-1, 6, 6) for r in (one, other)))):
+        scale = np.sqrt(np.diag(P))
+        size = np.where(scale > 0.0, scale, 1.0)
+        np.testing.assert_allclose(P / np.outer(size, size), Q / np.outer(size, size), rtol=0, atol=tolerance)
+    np.testing.assert_array_equal(one.memory.counters, other.memory.counters)

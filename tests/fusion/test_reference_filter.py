@@ -1,0 +1,63 @@
+"""The compiled filter against the plain one on filterpy: the same numbers on whole logs."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from filter_runs import LAYOUTS, assert_same, run, simulated
+
+from fusion import filter_loop, memory, reference_filter
+from fusion.fuse import run_filter
+from fusion.options import FuseOptions, Gate
+from fusion.prepare import pose_problem
+from poet_loc.io.log_folder import read_log
+
+
+@pytest.mark.parametrize("layout", LAYOUTS.values(), ids=LAYOUTS.keys())
+@pytest.mark.parametrize("noise", ["white", "network"])
+def test_compiled_is_plain_on_objects(layout, noise):
+    problem, options = simulated(layout=layout, noise=noise), FuseOptions()
+    compiled, plain = (run(loop, problem, options) for loop in (filter_loop.run_log, reference_filter.run_log))
+    assert_same(compiled, plain)
+    assert np.count_nonzero(compiled.decisions) > 50
+
+
+def test_compiled_is_plain_on_camera_poses():
+    problem, options = simulated("camera"), FuseOptions(measurements="camera")
+    compiled, plain = (run(loop, problem, options) for loop in (filter_loop.run_log, reference_filter.run_log))
+    assert_same(compiled, plain)
+    assert np.count_nonzero(compiled.decisions) > 50
+
+
+def test_compiled_is_plain_through_an_imu_gap_and_with_noise_that_adapts():
+    problem = simulated(noise="network", layout=LAYOUTS["everything"])
+    stamps = problem.imu.stamps_ns
+    kept = (stamps < stamps[250]) | (stamps > stamps[300])
+    problem = replace(problem, imu=problem.imu[kept][:-40])  # and measurements beyond the end
+    options = FuseOptions(gate=Gate(adaptation=0.05))
+    compiled, plain = (run(loop, problem, options) for loop in (filter_loop.run_log, reference_filter.run_log))
+    assert_same(compiled, plain)
+    assert np.any(compiled.memory.scales > 1.0)
+
+
+def test_run_reference_returns_what_run_filter_returns():
+    problem, options = simulated("camera"), FuseOptions(measurements="camera")
+    fast, plain = run_filter(problem, options), reference_filter.run_reference(problem, options)
+    assert (fast.name, plain.name) == ("fuse/eskf/camera", "fuse/reference/camera")
+    np.testing.assert_array_equal(fast.stamps_ns, plain.stamps_ns)
+    np.testing.assert_allclose(fast.T_world_imu.translation, plain.T_world_imu.translation, atol=1e-9)
+    np.testing.assert_allclose(fast.pose_covariances, plain.pose_covariances, rtol=1e-7, atol=1e-15)
+    np.testing.assert_array_equal(fast.gate.position_accepted, plain.gate.position_accepted)
+
+
+@pytest.mark.parametrize(("folder", "detections"), [("euroc_v101", None), ("ycbv_dope/0051", "selftrained")])
+def test_compiled_is_plain_on_real_logs(shared_data, folder, detections):
+    log, options = read_log(shared_data / folder), FuseOptions()
+    problem = pose_problem(log, options, object_poses=log.detections(detections)[1])
+    problem = replace(problem, imu=problem.imu[:2000])
+    compiled, plain = (run(loop, problem, options) for loop in (filter_loop.run_log, reference_filter.run_log))
+    assert_same(compiled, plain)
+    assert compiled.memory.counters[memory.MODE] == memory.TRACKING
+    assert np.count_nonzero(compiled.decisions) > 100
