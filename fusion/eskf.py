@@ -38,7 +38,7 @@ from fusion.so3_kernels import exp_so3, log_so3, multiply, multiply_transposed_l
 REJECTED, POSITION_ONLY, ROTATION_ONLY, ACCEPTED = 0, 1, 2, 3  # bit 0: position used, bit 1: rotation used
 
 # Places in the bias model, per kind: sigma of rotation (rad), across and along the ray (share of distance), time (s).
-BIAS_ROTATION, BIAS_ACROSS, BIAS_ALONG, BIAS_TAU, BIAS_JUMP, BIAS_MODEL_SIZE = range(6)
+BIAS_ROTATION, BIAS_ACROSS, BIAS_ALONG, BIAS_TAU, BIAS_JUMP, BIAS_JUMP_AT, BIAS_MODEL_SIZE = range(7)
 
 
 @njit(cache=True)
@@ -270,10 +270,10 @@ def _turn_gravity(x: Array, error: Array, at: int, scratch: Array) -> None:
 def decay_biases(x: Array, P: Array, seconds: float, bias_model: Array, layout: Ints) -> None:
     """Let the object biases relax for some seconds: first-order Gauss-Markov, exact for any step.
 
-    b <- phi b, P_b <- phi^2 P_b + (1 - phi^2) sigma^2 with phi = exp(-seconds / tau); an infinite tau stays put.
-    Their cross terms commute with the IMU's propagation, so this is done once per update and not once per sample.
+    b <- phi b, P_b <- phi^2 P_b + (1 - phi^2) sigma^2 with phi = exp(-seconds / tau); an infinite tau stays put. A bias
+    far outside its sigma is a gross error in a run: it does not fade, and it wanders as far as it jumps.
+    Cross terms commute with the IMU's propagation, so this is done once per update and not once per sample.
     """
-    n = layout[N_ERROR]
     for kind in range(layout[N_BIAS_KINDS]):
         model = kind * BIAS_MODEL_SIZE
         phi = math.exp(-seconds / bias_model[model + BIAS_TAU])
@@ -281,15 +281,37 @@ def decay_biases(x: Array, P: Array, seconds: float, bias_model: Array, layout: 
             continue
         for k in range(layout[N_OBJECTS]):
             shift = 6 * (k + kind * layout[N_OBJECTS])
-            at, b = layout[AT_BIASES] + shift, layout[BIASES] + shift
-            for i in range(6):
-                sigma = bias_sigma(bias_model, kind, i)
-                x[b + i] *= phi
-                for j in range(n):
-                    P[at + i, j] *= phi
-                for j in range(n):
-                    P[j, at + i] *= phi
-                P[at + i, at + i] += (1.0 - phi * phi) * sigma * sigma
+            for first in (0, 3):
+                _decay(
+                    x,
+                    P,
+                    layout[N_ERROR],
+                    layout[BIASES] + shift,
+                    layout[AT_BIASES] + shift,
+                    first,
+                    kind,
+                    phi,
+                    bias_model,
+                )
+
+
+@njit(cache=True)
+def _decay(x: Array, P: Array, n: int, b: int, at: int, first: int, kind: int, phi: float, bias_model: Array) -> None:
+    furthest = 0.0
+    for i in range(first, first + 3):
+        furthest = max(furthest, abs(x[b + i]) / bias_sigma(bias_model, kind, i))
+    fades = furthest <= bias_model[kind * BIAS_MODEL_SIZE + BIAS_JUMP_AT]
+    for i in range(first, first + 3):
+        sigma = bias_sigma(bias_model, kind, i)
+        if fades:
+            x[b + i] *= phi
+            for j in range(n):
+                P[at + i, j] *= phi
+            for j in range(n):
+                P[j, at + i] *= phi
+        else:
+            sigma *= bias_model[kind * BIAS_MODEL_SIZE + BIAS_JUMP]
+        P[at + i, at + i] += (1.0 - phi * phi) * sigma * sigma
 
 
 @njit(cache=True)

@@ -52,10 +52,12 @@ class DetectionBias:
     """The same along the ray."""
     steady_rotation_deg: float = 3.5
     """The same in rotation per axis, deg."""
-    jump_after: int = 10
+    jump_after: int = 20
     """An object refused so often in a row has another bias: the old one is forgotten."""
-    jump: float = 4.0
-    """The new one's 1-sigma, in units of the above."""
+    jump: float = 5.0
+    """The new one's 1-sigma, in units of the varying bias's."""
+    gross: float = 5.0
+    """A varying bias beyond so many sigma is a gross error in a run: it does not fade, it jumps."""
 
 
 @dataclass(frozen=True)
@@ -141,6 +143,28 @@ class Gap:
 
 
 @dataclass(frozen=True)
+class Graph:
+    """The factor graph."""
+
+    keyframe_rate_hz: float = 10.0
+    """Keyframes at camera stamps, at most so many per second, Hz; measurements between them are kept."""
+    idle_s: float = 0.5
+    """Without measurements there is a keyframe after so long, s."""
+    lag_s: float = 2.0
+    """How far back the fixed-lag smoother still changes its mind, s."""
+    kernel: Literal["none", "huber", "cauchy", "geman-mcclure"] = "huber"
+    """Robust kernel of the measurements that passed the gate."""
+    kernel_width: float = 3.5
+    """Where it begins to bend, in 1-sigma of all six rows."""
+    relinearize: float = 0.01
+    """The fixed-lag smoother linearises anew what has moved by more, rad and m."""
+    max_iterations: int = 20
+    """Steps of the batch optimiser."""
+    rounds: int = 3
+    """How often the batch decides anew, from its own trajectory, which measurements pass the gate."""
+
+
+@dataclass(frozen=True)
 class FuseOptions:
     """Camera or object poses and an IMU become a trajectory."""
 
@@ -155,3 +179,4 @@ class FuseOptions:
     start: Start = field(default_factory=Start)
     prior: Prior = field(default_factory=Prior)
     gap: Gap = field(default_factory=Gap)
+    graph: Graph = field(default_factory=Graph)

@@ -177,6 +177,7 @@ def fill_memory(problem: Problem, options: FuseOptions) -> tuple[Array, NDArray[
     m.bias_model[eskf.BIAS_ALONG] = bias.along
     m.bias_model[eskf.BIAS_TAU] = bias.correlation_s
     m.bias_model[eskf.BIAS_JUMP] = bias.jump
+    m.bias_model[eskf.BIAS_JUMP_AT] = bias.gross
     steady = m.bias_model[eskf.BIAS_MODEL_SIZE :]
     steady[eskf.BIAS_ROTATION] = math.radians(bias.steady_rotation_deg)
     steady[[eskf.BIAS_ACROSS, eskf.BIAS_ALONG, eskf.BIAS_TAU]] = bias.steady_across, bias.steady_along, math.inf
