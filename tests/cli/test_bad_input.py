@@ -58,6 +58,11 @@ def later_by_an_hour(path: Path) -> None:
     path.write_text("\n".join([header, *moved]) + "\n")
 
 
+def add_column(path: Path) -> None:
+    header, *rows = path.read_text().splitlines()
+    path.write_text("\n".join([f"{header},colour", *(f"{row},3" for row in rows)]) + "\n")
+
+
 def in_millimetres(path: Path) -> None:
     header, *rows = [line.split(",") for line in path.read_text().splitlines()]
     first = header.index("tx")
@@ -93,7 +98,8 @@ SPOILT = {
     "calibration without its keys": (CALIBRATION, text("cam0: {T_cam_imus: 3}\n"), ["calibration.yaml"]),
     "a word where a number belongs": (OBJECTS, cell(5, 6, "far"), ["object_poses.csv:5", "far"]),
     "a missing cell": (IMU, edit_line(4, lambda cells: cells[:-1]), ["imu.csv:4"]),
-    "an unknown column": (OBJECTS, cell(1, 4, "skore"), ["object_poses.csv:1", "skor"]),
+    "a missing column": (OBJECTS, cell(1, 4, "skore"), ["object_poses.csv:1", "score is missing"]),
+    "an unknown column": (OBJECTS, add_column, ["object_poses.csv:1", "colour"]),
     "nan": (OBJECTS, cell(9, 6, "nan"), ["object_poses.csv:9"]),
     "nan in imu": (IMU, cell(12, 3, "NaN"), ["imu.csv:12"]),
     "zero quaternion": (OBJECTS, cells(7, 8, ["0"] * 4), ["object_poses.csv:7", "quaternion"]),
@@ -116,7 +122,7 @@ def test_a_spoilt_log_is_one_line(mistake, log, tmp_path, capsys):
     file, spoil, said = SPOILT[mistake]
     spoil(log / file)
     before = sorted(path.name for path in tmp_path.iterdir())
-    assert main(["run", str(log), "--out", str(tmp_path / "new" / "run")]) == 1
+    assert main(["run", str(log), "--out", str(tmp_path / "run")]) == 1
     line = one_line(capsys)
     assert all(part in line for part in said), line
     assert "Traceback" not in line

@@ -1,0 +1,309 @@
+"""The commands on a small simulated log: what they write, what they say, what they leave out."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+from test_main import one_line
+
+from fusion.simulate import SimulationOptions, simulate
+from poet_loc.cli import run as run_command
+from poet_loc.cli import view as view_command
+from poet_loc.cli.main import main
+from poet_loc.io.camera_poses_csv import read_camera_poses, write_camera_poses
+from poet_loc.io.log_folder import read_log
+from poet_loc.io.tum import read_tum
+
+MODES = ("all", "out", "prev", "best", "robust")
+FILES = {
+    "camera_poses.csv",
+    "T_world_cam.tum",
+    "T_world_imu.tum",
+    "states.csv",
+    "errors.csv",
+    "summary.json",
+    "table.md",
+    "table.tex",
+    "figures",
+    "recording.rrd",
+    "options.yaml",
+    "localize",
+    "fuse",
+}
+
+
+def files(folder: Path) -> set[str]:
+    return {path.name for path in folder.iterdir()}
+
+
+def summary(run: Path) -> dict:
+    return json.loads((run / "summary.json").read_text())
+
+
+def rmse_mm(row: dict) -> float:
+    return row["position_error_mm"]["norm"]["rmse"]
+
+
+@pytest.fixture(scope="module")
+def run(clean_log, tmp_path_factory) -> Path:
+    """A whole run, with pictures."""
+    out = tmp_path_factory.mktemp("runs") / "run"
+    assert main(["run", str(clean_log), "--out", str(out)]) == 0
+    return out
+
+
+def test_a_run_has_the_files_that_the_formats_name(run):
+    assert files(run) == FILES
+    assert {path.name for path in (run / "localize").iterdir()} == set(MODES)
+    assert all(files(run / "localize" / mode) == {"camera_poses.csv", "T_world_cam.tum"} for mode in MODES)
+    assert files(run / "fuse" / "eskf" / "objects") == {"T_world_imu.tum", "states.csv"}
+    assert list((run / "figures").glob("*.png"))
+    assert files(run.parent) == {"run"}, "nothing temporary is left"
+
+
+def test_the_top_of_a_run_is_robust_and_the_filter_on_objects(run):
+    for name in ("camera_poses.csv", "T_world_cam.tum"):
+        assert (run / name).read_bytes() == (run / "localize" / "robust" / name).read_bytes()
+    for name in ("states.csv", "T_world_imu.tum"):
+        assert (run / name).read_bytes() == (run / "fuse" / "eskf" / "objects" / name).read_bytes()
+
+
+def test_a_runs_summary_names_every_estimate_and_the_filter_is_good(run):
+    rows = summary(run)
+    assert {f"localize/{mode}" for mode in MODES} | {"fuse/eskf/objects", "fuse/eskf/camera"} <= rows.keys()
+    assert rmse_mm(rows["fuse/eskf/objects"]) < rmse_mm(rows["localize/prev"])
+    assert rows["localize/best"]["oracle"]
+    assert rows["fuse/eskf/objects"]["coverage"] > 0.9
+
+
+def test_states_agree_with_the_trajectory_and_carry_positive_sigmas(run):
+    lines = (run / "states.csv").read_text().splitlines()
+    header, values = lines[0].split(","), np.array([line.split(",")[1:] for line in lines[1:]], dtype=float)
+    trajectory = read_tum(run / "T_world_imu.tum")
+    assert [int(line.split(",")[0]) for line in lines[1:]] == trajectory.stamps_ns.tolist()
+    assert header[:4] == ["timestamp_ns", "px", "py", "pz"]
+    np.testing.assert_allclose(values[:, :3], trajectory.T_world_body.translation, atol=1e-8)
+    sigmas = [i - 1 for i, name in enumerate(header) if name.startswith("sigma_")]
+    assert len(sigmas) == 15
+    assert np.all(values[:, sigmas] > 0.0)
+
+
+def test_options_tell_what_was_asked_and_the_versions(run, clean_log):
+    told = yaml.safe_load((run / "options.yaml").read_text())
+    assert told["command"] == "run"
+    assert told["asked"]["log"] == str(clean_log)
+    assert told["asked"]["options"]["solver"]["mode"] == "robust"
+    assert told["versions"]["poet-loc"]
+
+
+def test_evaluate_prints_the_same_error_as_the_run(run, clean_log, capsys):
+    arguments = [str(run / "T_world_cam.tum"), str(clean_log / "T_world_cam.tum")]
+    assert main(["evaluate", *arguments]) == 0
+    line = next(line for line in capsys.readouterr().out.splitlines() if line.startswith("| norm"))
+    assert float(line.split("|")[7]) == pytest.approx(rmse_mm(summary(run)["localize/robust"]), abs=0.06)
+
+
+def test_a_run_is_replaced_only_when_told_to(clean_log, tmp_path, capsys):
+    out = tmp_path / "run"
+    assert main(["localize", str(clean_log), "--out", str(out), "--mode", "all", "--no-pictures"]) == 0
+    before = (out / "camera_poses.csv").read_bytes()
+    capsys.readouterr()
+    assert main(["localize", str(clean_log), "--out", str(out), "--no-pictures"]) == 1
+    assert "--overwrite" in one_line(capsys)
+    assert (out / "camera_poses.csv").read_bytes() == before
+    assert main(["localize", str(clean_log), "--out", str(out), "--no-pictures", "--overwrite"]) == 0
+    assert (out / "camera_poses.csv").read_bytes() != before
+    assert summary(out).keys() == {"localize/robust"}
+
+
+@pytest.mark.parametrize("had_results", [False, True])
+def test_an_interrupted_run_leaves_the_old_folder_or_none(had_results, clean_log, tmp_path, capsys, monkeypatch):
+    out = tmp_path / "run"
+    if had_results:
+        out.mkdir()
+        (out / "summary.json").write_text("old")
+
+    def interrupted(folder, *_):
+        (folder / "half.csv").write_text("1,2,")
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(run_command, "write_run", interrupted)
+    assert main(["run", str(clean_log), "--out", str(out), "--overwrite"]) == 130
+    assert one_line(capsys) == "poet-loc: interrupted\n"
+    assert {path.name for path in tmp_path.rglob("*")} == ({"run", "summary.json"} if had_results else set())
+
+
+def test_localize_and_fuse_give_the_rows_of_the_run(run, clean_log, tmp_path):
+    whole = summary(run)
+    for mode in ("prev", "best"):
+        assert main(["localize", str(clean_log), "--out", str(tmp_path / mode), "--mode", mode, "--no-pictures"]) == 0
+        assert rmse_mm(summary(tmp_path / mode)[f"localize/{mode}"]) == pytest.approx(
+            rmse_mm(whole[f"localize/{mode}"])
+        )
+    for measurements in ("objects", "camera"):
+        out = tmp_path / measurements
+        assert main(["fuse", str(clean_log), "--out", str(out), "--measurements", measurements, "--no-pictures"]) == 0
+        name = f"fuse/eskf/{measurements}"
+        assert rmse_mm(summary(out)[name]) == pytest.approx(rmse_mm(whole[name]))
+        assert "T_world_imu.tum" in files(out)
+
+
+def test_fuse_takes_camera_poses_from_the_mode_or_from_the_log(log, tmp_path):
+    asked = ["fuse", str(log), "--measurements", "camera", "--no-pictures", "--out"]
+    assert main([*asked, str(tmp_path / "robust")]) == 0
+    assert main([*asked, str(tmp_path / "prev"), "--mode", "prev"]) == 0
+    assert summary(tmp_path / "prev").keys() == {"localize/prev", "fuse/eskf/camera"}
+    shutil.copy(tmp_path / "prev" / "camera_poses.csv", log / "camera_poses.csv")
+    assert main([*asked, str(tmp_path / "given")]) == 0
+    errors = {name: rmse_mm(summary(tmp_path / name)["fuse/eskf/camera"]) for name in ("robust", "prev", "given")}
+    assert errors["given"] == pytest.approx(errors["prev"], rel=1e-6)
+    assert errors["robust"] != pytest.approx(errors["prev"], rel=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("missing", "said", "gone", "kept"),
+    [
+        (["imu.csv"], "no imu.csv", {"T_world_imu.tum", "states.csv", "fuse"}, {"T_world_cam.tum", "summary.json"}),
+        (["calibration.yaml"], "no calibration.yaml", {"states.csv", "fuse"}, {"T_world_cam.tum", "summary.json"}),
+        (
+            ["T_world_cam.tum", "T_world_imu.tum"],
+            "ground truth",
+            {"summary.json", "errors.csv", "table.md", "table.tex"},
+            {"T_world_cam.tum", "T_world_imu.tum", "states.csv"},
+        ),
+    ],
+)
+def test_what_a_log_lacks_is_said_and_left_out(missing, said, gone, kept, log, tmp_path, capsys):
+    for name in missing:
+        (log / name).unlink()
+    assert main(["run", str(log), "--out", str(tmp_path / "run"), "--no-pictures"]) == 0
+    notes = capsys.readouterr().err.splitlines()
+    assert any(said in note for note in notes)
+    assert len(notes) <= 2
+    there = files(tmp_path / "run")
+    assert kept <= there
+    assert not gone & there
+
+
+def test_fuse_without_an_imu_is_one_line(log, tmp_path, capsys):
+    (log / "imu.csv").unlink()
+    assert main(["fuse", str(log), "--out", str(tmp_path / "run")]) == 1
+    assert "no imu.csv" in one_line(capsys)
+    assert files(tmp_path) == {"log"}
+
+
+def test_a_log_of_camera_poses_alone_runs(log, tmp_path):
+    write_camera_poses(
+        log / "camera_poses.csv", simulate(SimulationOptions(8.0, seed=1, camera_poses=True)).camera_poses
+    )
+    (log / "object_poses.csv").unlink()
+    (log / "landmarks.json").unlink()
+    assert main(["run", str(log), "--out", str(tmp_path / "run"), "--no-pictures"]) == 0
+    rows = summary(tmp_path / "run")
+    assert rows.keys() >= {"localize/given", "fuse/eskf/camera"}
+    assert rmse_mm(rows["fuse/eskf/camera"]) < rmse_mm(rows["localize/given"])
+
+
+def test_table_over_logs_and_detections_in_every_format(clean_log, log, tmp_path, capsys):
+    shutil.copy(log / "object_poses.csv", log / "object_poses_other.csv")
+    asked = ["table", str(clean_log), str(log), "--modes", "all", "prev"]
+    assert main(asked) == 0
+    shown = capsys.readouterr().out
+    assert shown.startswith("**Errors on the common frames**")
+    assert shown.count("| localize/prev") + shown.count(" localize/prev ") >= 2
+    assert "all 2 logs" in shown
+    for suffix, mark in ((".tex", r"\begin{tabular}"), (".csv", "log,detections,name"), (".json", "["), (".md", "**")):
+        out = tmp_path / f"table{suffix}"
+        assert main([*asked, "--out", str(out)]) == 0
+        assert out.read_text().startswith(mark) or mark in out.read_text()
+    records = json.loads((tmp_path / "table.json").read_text())
+    groups = {(record["log"], record["detections"]) for record in records}
+    assert len(groups) == 2 + 3, "two sets pooled, three sets in two logs"
+    assert main([*asked, "--with-fusion", "--pooled-only", "--format", "json"]) == 0
+    capsys.readouterr()
+    assert main([*asked, "--out", str(tmp_path / "table.md")]) == 1
+    assert "--overwrite" in one_line(capsys)
+    assert main([*asked, "--out", str(tmp_path / "table.docx")]) == 1
+    assert "--format" in one_line(capsys)
+
+
+def test_table_fuses_when_asked(clean_log, capsys):
+    assert main(["table", str(clean_log), "--modes", "best", "--with-fusion", "--format", "csv"]) == 0
+    names = [line.split(",")[2] for line in capsys.readouterr().out.splitlines()[1:]]
+    assert {"localize/best", "fuse/eskf/objects"} <= set(names)
+
+
+def test_sensitivity_lists_each_option_with_its_default(clean_log, capsys):
+    assert main(["table", str(clean_log), "--sensitivity", "--format", "json"]) == 0
+    rows = json.loads(capsys.readouterr().out)
+    options = {(row["mode"], row["option"]) for row in rows}
+    defaults = [(row["mode"], row["option"]) for row in rows if row["default"]]
+    assert ("out", "distance") in options
+    assert sorted(defaults) == sorted(options), "each option's default stands among its values, once"
+
+
+def test_convert_tum_makes_a_log_that_fuses(clean_log, tmp_path, capsys):
+    out = tmp_path / "log"
+    sigmas = ["--position-sigma-m", "0.01", "--attitude-sigma-deg", "0.5"]
+    trajectory = str(clean_log / "T_world_cam.tum")
+    assert main(["convert", "tum", trajectory, str(out), "--like", str(clean_log), *sigmas]) == 0
+    assert str(out) in capsys.readouterr().out
+    assert len(read_camera_poses(out / "camera_poses.csv")) == len(read_tum(clean_log / "T_world_cam.tum"))
+    run = ["--measurements", "camera", "--no-pictures", "--out", str(tmp_path / "run")]
+    assert main(["fuse", str(out), *run]) == 0
+    assert rmse_mm(summary(tmp_path / "run")["fuse/eskf/camera"]) < 5.0
+
+
+def test_simulate_writes_a_log_and_runs_many(tmp_path, capsys):
+    short = ["--duration-s", "5", "--objects", "3", "--symmetric-objects", "0"]
+    assert main(["simulate", "--out", str(tmp_path / "log"), "--seed", "4", *short]) == 0
+    log = read_log(tmp_path / "log")
+    assert log.landmark_map is not None
+    assert len(log.landmark_map) == 3
+    expected = simulate(SimulationOptions(duration_s=5.0, seed=4, objects=3, symmetric_objects=0))
+    np.testing.assert_array_equal(log.imu.specific_force, expected.imu.specific_force)
+    capsys.readouterr()
+    assert main(["simulate", "--runs", "2", "--workers", "1", *short]) == 0
+    shown = capsys.readouterr().out
+    assert "| fuse/eskf/objects" in shown
+    assert main(["simulate"]) == 1
+    assert "--runs" in one_line(capsys)
+
+
+def test_demo_writes_a_log_and_a_run(tmp_path, monkeypatch, capsys):
+    from poet_loc.cli import demo
+
+    monkeypatch.setattr(demo, "simulate", lambda options: simulate(replace(options, duration_s=6.0)))
+    assert main(["demo", "--out", str(tmp_path / "demo"), "--seed", "2"]) == 0
+    shown = capsys.readouterr().out
+    assert files(tmp_path / "demo" / "run") == FILES
+    assert str(tmp_path / "demo" / "run" / "recording.rrd") in shown
+    assert read_log(tmp_path / "demo" / "log").imu is not None
+    assert yaml.safe_load((tmp_path / "demo" / "run" / "options.yaml").read_text())["asked"]["seed"] == 2
+
+
+def test_view_opens_recordings_and_serves_on_this_machine_only(run, monkeypatch):
+    calls = []
+    monkeypatch.setattr(view_command.subprocess, "call", lambda words: calls.append(words) or 0)
+    assert main(["view", str(run)]) == 0
+    assert main(["view", str(run), str(run), "--web"]) == 0
+    recording, here = str(run / "recording.rrd"), ["--bind", "127.0.0.1"]
+    assert [words[1:] for words in calls] == [[*here, recording], [*here, "--web-viewer", recording, recording]]
+
+
+def test_the_program_itself_in_a_pipe(clean_log, tmp_path):
+    program = "import sys; from poet_loc.cli.main import main; sys.exit(main())"
+    words = ["localize", str(clean_log), "--out", str(tmp_path / "run"), "--no-pictures"]
+    done = subprocess.run([sys.executable, "-c", program, *words], capture_output=True, text=True, check=False)
+    assert done.returncode == 0
+    assert done.stderr == ""
+    assert done.stdout.startswith("**Errors on the common frames**")
+    assert str(tmp_path / "run" / "summary.json") in done.stdout
