@@ -9,7 +9,6 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import yaml
 
 from fusion.result import FuseResult
@@ -17,10 +16,10 @@ from landmarks.localize import LocalizeResult
 from poet_loc.cli.estimates import Estimates
 from poet_loc.cli.terminal import Report
 from poet_loc.io.camera_poses_csv import write_camera_poses
-from poet_loc.io.number_table import write_csv
 from poet_loc.io.tum import write_tum
 from poet_loc.io.whole_folder import write_whole_file
 from poet_loc.report.error_tables import Block, table_text
+from poet_loc.report.run_folder import write_states
 from poet_loc.report.summary import to_summary, write_errors_csv, write_summary
 
 WRITING_STEPS = 3
@@ -63,28 +62,7 @@ def write_localized(folder: Path, result: LocalizeResult) -> None:
 def write_fused(folder: Path, result: FuseResult) -> None:
     """Write T_world_imu.tum and states.csv: m, m/s, rad/s, m/s^2; attitude sigmas in rad about the imu's axes."""
     write_tum(folder / "T_world_imu.tum", result.trajectory)
-    T = result.T_world_imu
-    blocks = {
-        "position": ("px", "py", "pz"),
-        "velocity": ("vx", "vy", "vz"),
-        "quaternion": ("qx", "qy", "qz", "qw"),
-        "gyroscope_bias": ("bgx", "bgy", "bgz"),
-        "accelerometer_bias": ("bax", "bay", "baz"),
-    }
-    sigmas = ("rx", "ry", "rz", *blocks["position"], *blocks["velocity"])
-    sigmas += (*blocks["gyroscope_bias"], *blocks["accelerometer_bias"])
-    header = ["timestamp_ns", *(name for names in blocks.values() for name in names), *(f"sigma_{s}" for s in sigmas)]
-    columns = np.hstack(
-        [
-            T.translation,
-            result.velocity,
-            T.rotation.as_quat(),
-            result.gyroscope_bias,
-            result.accelerometer_bias,
-            result.sigmas,
-        ]
-    )
-    write_csv(folder / "states.csv", header, [result.stamps_ns, *columns.round(9).T])
+    write_states(folder / "states.csv", result)
 
 
 def options_text(asked: Any) -> str:
