@@ -1,0 +1,110 @@
+"""The preset `embedded`: from rendered images to a calibrated checkpoint, resumable at every stage."""
+
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from poet_loc.data.packed import PackedImages, load_models, pack
+from poet_loc.model.checkpoint import ModelConfig, save_model
+from poet_loc.model.poet import PoET
+from poet_loc.model.small_detector import SmallDetector, SmallDetectorOptions
+from poet_loc.train.calibration import scale_sigmas, temperatures
+from poet_loc.train.detector import TrainDetectorOptions, train_detector
+from poet_loc.train.embedded import EMBEDDED, TrainEmbeddedOptions, pose_errors, predict, train_embedded
+from poet_loc.train.steps import StepOptions
+
+
+@dataclass(frozen=True)
+class EmbeddedPresetOptions:
+    """Render, train and calibrate the embedded detector and pose network; run it again to go on."""
+
+    out: Path
+    """Folder of data, caches, checkpoints and the result embedded.safetensors."""
+    train_images: int = 20000
+    """Rendered training images."""
+    val_images: int = 1000
+    """Rendered validation images, of other scenes."""
+    detector_steps: int = 700
+    """Steps of the detector alone, before the pose network joins."""
+    joint_steps: int = 2900
+    """Steps of detector and pose network together."""
+    batch: int = 16
+    """Images per step."""
+    seed: int = 0
+    """Seed of data and weights."""
+    precision: str = "auto"
+    """auto: bfloat16 where the CPU has matrix units for it, else float32."""
+    minutes: float = math.inf
+    """CPU minutes of each stage in this stretch."""
+    jobs: int = -1
+    """Processes that render; -1: one per core."""
+
+
+def train_preset(options: EmbeddedPresetOptions) -> Path:
+    """Do whatever is missing and return the checkpoint."""
+    from poet_loc.data.render import RenderOptions, render
+
+    world, cache = options.out / "world", options.out / "packed"
+    shared = {"out": world, "seed": options.seed, "jobs": options.jobs}
+    render(RenderOptions(split="val", images=options.val_images, first_scene=900_000, **shared))  # type: ignore[arg-type]
+    render(RenderOptions(split="train", images=options.train_images, **shared))  # type: ignore[arg-type]
+    first = _steps(options, "detector", options.detector_steps, 1e-3)
+    train_detector(TrainDetectorOptions(world, cache, first))
+    detector = SmallDetector(SmallDetectorOptions())
+    detector.load_state_dict(torch.load(options.out / "detector" / "checkpoint.pt", weights_only=True)["module"])
+    steps = _steps(options, "joint", options.joint_steps, 7e-4)
+    network = train_embedded(TrainEmbeddedOptions(world, cache, steps, fine_tune=True), detector)
+    return finish(network, world, cache, options.out / "embedded.safetensors", history(options.out))
+
+
+def _steps(options: EmbeddedPresetOptions, stage: str, count: int, rate: float) -> StepOptions:
+    return StepOptions(
+        options.out / stage,
+        steps=count,
+        batch=options.batch,
+        learning_rate=rate,
+        precision=options.precision,
+        seed=options.seed,
+        minutes=options.minutes,
+    )
+
+
+def history(folder: Path) -> dict[str, object]:
+    """Return what a run's logs say about its length, for the record in the checkpoint."""
+    last = {}
+    for stage in ("detector", "joint"):
+        path = folder / stage / "log.jsonl"
+        rows = [json.loads(line) for line in path.read_text().splitlines()] if path.exists() else []
+        last[stage] = {key: rows[-1][key] for key in ("step", "cpu_minutes")} if rows else {}
+    return {"preset": "embedded", **last}
+
+
+def finish(network: PoET, world: Path, cache: Path, out: Path, source: dict[str, object]) -> Path:
+    """Calibrate a network on the validation images and write it in half precision."""
+    models = load_models(world / "models")
+    val = PackedImages(pack(world / "val", cache / "val"), models)
+    t, R, log_variance, truth = predict(network.float(), val, len(val), models)
+    error = pose_errors(t, R, truth).double().numpy()
+    factors = temperatures(error, log_variance.double().numpy())
+    scale_sigmas(network, factors)
+    names = json.loads((world / "models" / "names.json").read_text())
+    ids = tuple(sorted(int(key) for key in names))
+    detector = network.detector
+    assert isinstance(detector, SmallDetector)
+    config = ModelConfig(
+        EMBEDDED,
+        detector.options,
+        ids,
+        tuple(names[str(number)] for number in ids),
+        image_size=(320, 240),
+        source={**source, "temperatures": [round(float(value), 4) for value in factors], "images": len(val)},
+    )
+    assert np.all(np.isfinite(factors))
+    save_model(out, network, config, half=True)
+    return out

@@ -1,0 +1,195 @@
+"""What a checkpoint does on the test videos: the figures of its model card."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import RigidTransform
+
+from poet_loc.core.object_errors import add_s, area_under_curve
+from poet_loc.core.records import ObjectPoses
+from poet_loc.data.packed import ObjectModels, load_models
+from poet_loc.io.bop import BopScene, read_bop_scene
+from poet_loc.io.frames_csv import read_frames
+from poet_loc.model.checkpoint import load_model
+from poet_loc.train.average_precision import mean_average_precision
+from poet_loc.train.video_poses import Boxes, poses_of_video, true_boxes
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class MeasureOptions:
+    """Which checkpoint to measure on which videos."""
+
+    weights: Path
+    """Checkpoint (safetensors)."""
+    videos: Path
+    """Folder of rendered videos, with models/."""
+    write_poses: bool = True
+    """Write object_poses_bb.csv and object_poses_gt.csv into the videos' folders."""
+    least_visible: float = 0.1
+    """Objects less visible than this share are not asked for."""
+
+
+@dataclass(frozen=True)
+class PoseScores:
+    """Errors of every object that was there; what was missed has infinite errors."""
+
+    object_ids: NDArray[np.int64]
+    translation_m: Array
+    rotation_rad: Array
+    """About a symmetry axis the axis' error."""
+    add_s_m: Array
+    error: Array
+    """(N, 6) translation and rotation vector in camera axes; nan where missed."""
+    sigma: Array
+    """(N, 6) what the network claims."""
+
+
+@dataclass(frozen=True)
+class Figures:
+    """All that the card says."""
+
+    scores: dict[Boxes, PoseScores]
+    mean_average_precision: float
+    """IoU 0.5, over whole (amodal) boxes."""
+    mean_average_precision_coco: float
+    """Mean over IoU 0.5, 0.55 .. 0.95."""
+    frames: int
+    names: dict[int, str] = field(default_factory=dict)
+    silhouette_symmetric: tuple[int, ...] = ()
+
+
+def measure(options: MeasureOptions) -> Figures:
+    """Run a checkpoint over all videos and compare with the truth."""
+    import json
+
+    from poet_loc.data.world.objects import household_objects
+    from poet_loc.io.object_poses_csv import write_object_poses
+
+    network, config = load_model(options.weights)
+    models = load_models(options.videos / "models")
+    names = {int(k): v for k, v in json.loads((options.videos / "models" / "names.json").read_text()).items()}
+    parts: dict[Boxes, list[PoseScores]] = {"bb": [], "gt": []}
+    detections: list[Array] = []
+    truth: list[Array] = []
+    for folder in sorted(path.parent for path in options.videos.glob("*/frames.csv")):
+        scene, frames = read_bop_scene(folder), read_frames(folder / "frames.csv")
+        found = poses_of_video(network, config, folder)
+        for kind, poses in found.poses.items():
+            parts[kind].append(score_poses(poses, scene, models, options.least_visible))
+            if options.write_poses:
+                write_object_poses(folder / f"object_poses_{kind}.csv", poses)
+        detections += found.detections
+        truth += [_boxes_with_class(scene, row, options.least_visible) for row in range(len(frames))]
+    coco = tuple(np.arange(0.5, 1.0, 0.05))
+    return Figures(
+        {kind: _joined(rows) for kind, rows in parts.items()},
+        mean_average_precision(detections, truth),
+        mean_average_precision(detections, truth, coco),
+        len(truth),
+        names,
+        tuple(thing.object_id for thing in household_objects() if thing.silhouette_symmetric),
+    )
+
+
+def _boxes_with_class(scene: BopScene, row: int, least_visible: float) -> Array:
+    rows = true_boxes(scene, row, least_visible).double().numpy()
+    return np.asarray(rows[:, [0, 1, 2, 3, 5]])
+
+
+def score_poses(poses: ObjectPoses, scene: BopScene, models: ObjectModels, least_visible: float) -> PoseScores:
+    """Compare a video's poses with every object that is visible enough; the best-scored row of each counts."""
+    found = scene.annotations
+    assert found is not None
+    assert found.visible_fractions is not None
+    asked = np.concatenate([true_boxes(scene, row, least_visible)[:, 5].numpy() for row in range(len(scene))])
+    frame_of = np.repeat(np.arange(len(scene)), [len(true_boxes(scene, r, least_visible)) for r in range(len(scene))])
+    annotated = {(int(i), int(o)): row for row, (i, o) in enumerate(zip(found.image_ids, found.object_ids))}
+    answer: dict[tuple[int, int], int] = {}
+    for row in np.argsort(poses.scores, kind="stable"):
+        answer[int(poses.frames[row]), int(poses.object_ids[row])] = int(row)
+    keys = [(int(frame), int(label)) for frame, label in zip(frame_of, asked)]
+    count = len(keys)
+    error, sigma = np.full((count, 6), np.nan), np.full((count, 6), np.nan)
+    add_s_m = np.full(count, np.inf)
+    there = np.array([key in answer for key in keys], bool)
+    rows, refs = [answer[k] for k in keys if k in answer], [annotated[k] for k in keys if k in answer]
+    labels = np.array([key[1] for key in keys], np.int64)
+    if rows:
+        est, ref = poses.T_cam_obj[np.array(rows)], found.T_cam_obj[np.array(refs)]
+        error[there] = _errors(est, ref, models.symmetry_axes[labels[there] - 1])
+        add_s_m[there] = _add_s(est, ref, labels[there], models)
+        if poses.covariances is not None:
+            spread = np.sqrt(np.einsum("nii->ni", poses.covariances[np.array(rows)]))
+            sigma[there] = np.concatenate([spread[:, 3:], spread[:, :3]], 1)
+    distance, angle = np.linalg.norm(error[:, :3], axis=1), np.linalg.norm(error[:, 3:], axis=1)
+    missed = np.isnan(distance)
+    return PoseScores(
+        labels, np.where(missed, np.inf, distance), np.where(missed, np.inf, angle), add_s_m, error, sigma
+    )
+
+
+def _errors(est: RigidTransform, ref: RigidTransform, axes: Array) -> Array:
+    """(N, 6) translation and rotation vector of R_est = Exp(e) R_ref, in camera axes; the tilt of a symmetry axis."""
+    rotation = (est.rotation * ref.rotation.inv()).as_rotvec()
+    symmetric = np.abs(axes).sum(1) > 0
+    if symmetric.any():
+        a, b = ref.rotation[symmetric].apply(axes[symmetric]), est.rotation[symmetric].apply(axes[symmetric])
+        cross = np.cross(a, b)
+        sine = np.linalg.norm(cross, axis=1)
+        angle = np.arctan2(sine, (a * b).sum(1))
+        rotation[symmetric] = cross / np.maximum(sine, 1e-12)[:, None] * angle[:, None]
+    return np.concatenate([est.translation - ref.translation, rotation], 1)
+
+
+def _add_s(est: RigidTransform, ref: RigidTransform, labels: NDArray[np.int64], models: ObjectModels) -> Array:
+    result = np.zeros(len(labels))
+    for label in np.unique(labels):
+        chosen = np.flatnonzero(labels == label)
+        result[chosen] = add_s(est[chosen], ref[chosen], models.surface[label - 1])
+    return result
+
+
+def _joined(parts: Sequence[PoseScores]) -> PoseScores:
+    names = ("object_ids", "translation_m", "rotation_rad", "add_s_m", "error", "sigma")
+    return PoseScores(*(np.concatenate([getattr(part, name) for part in parts]) for name in names))
+
+
+def card_table(figures: Figures) -> str:
+    """Return the figures as Markdown: medians with everything asked for, misses included, per object and in all."""
+    lines = [
+        f"{figures.frames} frames; mAP {100 * figures.mean_average_precision:.1f} at IoU 0.5, "
+        f"{100 * figures.mean_average_precision_coco:.1f} at 0.5:0.95.",
+        "",
+        "| object | boxes | asked | found % | t cm | r deg | AUC ADD-S |",
+        "|---|---|--:|--:|--:|--:|--:|",
+    ]
+    for kind, scores in figures.scores.items():
+        for label in np.unique(scores.object_ids):
+            lines.append(_row(figures.names.get(int(label), str(label)), kind, scores, scores.object_ids == label))
+    for kind, scores in figures.scores.items():
+        lines.append(_row("**all**", kind, scores, np.ones(len(scores.object_ids), bool)))
+        plain = ~np.isin(scores.object_ids, figures.silhouette_symmetric)
+        lines.append(_row("**without silhouette symmetry**", kind, scores, plain))
+    lines += ["", "| boxes | within one sigma, x y z | about x y z |", "|---|---|---|"]
+    for kind, scores in figures.scores.items():
+        inside = 100 * np.nanmean(np.where(np.isnan(scores.error), np.nan, np.abs(scores.error) < scores.sigma), axis=0)
+        lines.append(f"| {kind} | {_percents(inside[:3])} | {_percents(inside[3:])} |")
+    return "\n".join(lines)
+
+
+def _row(name: str, kind: str, scores: PoseScores, chosen: NDArray[np.bool_]) -> str:
+    found = 100 * np.isfinite(scores.translation_m[chosen]).mean()
+    t, r = 100 * np.median(scores.translation_m[chosen]), np.rad2deg(np.median(scores.rotation_rad[chosen]))
+    auc = area_under_curve(np.minimum(scores.add_s_m[chosen], 1.0))
+    return f"| {name} | {kind} | {int(chosen.sum())} | {found:.1f} | {t:.2f} | {r:.1f} | {auc:.1f} |"
+
+
+def _percents(values: Array) -> str:
+    return " ".join(f"{value:.0f} %" for value in values)
