@@ -1,0 +1,1 @@
+"""From images to object poses with stamps, scores and covariances."""

@@ -1,0 +1,169 @@
+"""A loaded network that turns a batch of pictures into object poses."""
+
+from __future__ import annotations
+
+import time
+import warnings
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Protocol
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from poet_loc.core.input_error import InputError
+from poet_loc.data.samples import to_tensor
+from poet_loc.detect.box_file import read_boxes
+from poet_loc.detect.image_source import Picture
+from poet_loc.detect.options import DetectOptions
+from poet_loc.model.backbone import Features, ImageBatch, batch_images
+from poet_loc.model.checkpoint import ModelConfig, load_model
+from poet_loc.model.fast_poses import FastPoses
+from poet_loc.model.heads import covariance_matrices, rotation_matrices
+from poet_loc.model.poet import PoET, PoseOutput
+from poet_loc.model.queries import QueryBoxes, queries_from_detections
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Sighting:
+    """The objects of one picture, n rows."""
+
+    picture: Picture
+    labels: NDArray[np.int64]
+    """(n,) classes from 1."""
+    object_ids: NDArray[np.int64]
+    scores: Array
+    boxes: Array
+    """(n, 4) cx, cy, w, h in shares of the picture."""
+    translations: Array
+    """(n, 3) m."""
+    rotations: Array
+    """(n, 3, 3)."""
+    covariances: Array | None
+    """(n, 6, 6) of [e_r, e_t] in camera axes."""
+    seconds: float
+    """Run time per picture."""
+
+
+class PoseEngine(Protocol):
+    """What computes poses from features: the network itself, its fast path, or an exported graph."""
+
+    def poses(
+        self, features: Features, image_mask: Tensor, queries: QueryBoxes, intrinsics: Tensor | None = None
+    ) -> PoseOutput:
+        """Return the poses of boxes."""
+        ...
+
+
+class Estimator:
+    """Detector and pose network, ready for pictures."""
+
+    def __init__(self, options: DetectOptions, intrinsics: tuple[float, float, float, float] | None = None) -> None:
+        self.options = options
+        self.network, self.config = _load(options)
+        self.device = torch.device(options.device)
+        self.network.to(self.device).requires_grad_(False)
+        self.engine = self._engine()
+        self.intrinsics = options.intrinsics or intrinsics or self.config.intrinsics
+        if self.config.network.needs_intrinsics and self.intrinsics is None:
+            raise InputError("this network needs the camera's intrinsics", fix="give --intrinsics fx fy cx cy")
+        self.boxes = None if options.boxes is None else read_boxes(options.boxes)
+        self.multiple = self.network.detector.shape().multiple
+        self._warned = False
+
+    def _engine(self) -> PoseEngine:
+        options = self.options
+        if options.exported is not None:
+            from poet_loc.model.exported import ExportedPoses
+
+            return ExportedPoses(options.exported, self.network)
+        if options.engine == "eager" or self.device.type != "cpu":
+            return self.network
+        return FastPoses(self.network, "bfloat16" if options.engine == "bfloat16" else "float32")
+
+    @torch.no_grad()
+    def __call__(self, pictures: Sequence[Picture]) -> list[Sighting]:
+        """Return what is in each picture."""
+        start = time.perf_counter()
+        self._compare_cameras(pictures[0])
+        given = None if self.intrinsics is None else torch.tensor([self.intrinsics] * len(pictures))
+        batch = batch_images([to_tensor(p.pixels) for p in pictures], given, self.multiple).to(self.device)
+        features = self.network.extract(batch)
+        queries = self._queries(pictures, batch, features)
+        output = self.engine.poses(features, batch.mask, queries, batch.intrinsics)
+        seconds = (time.perf_counter() - start) / len(pictures)
+        return [self._sighting(picture, output, i, batch, seconds) for i, picture in enumerate(pictures)]
+
+    def _queries(self, pictures: Sequence[Picture], batch: ImageBatch, features: Features) -> QueryBoxes:
+        nothing = torch.zeros(0, 6)
+        if self.boxes is not None:
+            found = [self.boxes.get(Path(p.name).name, nothing) for p in pictures]
+        else:
+            found = self.network.detector.detect(features)
+        found = [rows[rows[:, 4] >= self.options.score] for rows in found]
+        beyond = [
+            int(rows[:, 5].max()) for rows in found if len(rows) and rows[:, 5].max() > self.config.network.class_count
+        ]
+        if beyond:
+            raise InputError(f"class {beyond[0]} is beyond the network's {self.config.network.class_count} classes")
+        return queries_from_detections(found, batch.size, self.config.network.queries, self.device)
+
+    def _sighting(
+        self, picture: Picture, output: PoseOutput, image: int, batch: ImageBatch, seconds: float
+    ) -> Sighting:
+        count = output.queries.counts[image]
+        labels = output.queries.classes[image, :count].cpu().numpy()
+        height, width = picture.pixels.shape[:2]
+        shares = torch.tensor([batch.size[1] / width, batch.size[0] / height] * 2)
+        return Sighting(
+            picture,
+            labels,
+            np.array([self.config.object_id(int(label)) for label in labels], np.int64),
+            output.queries.scores[image, :count].double().cpu().numpy(),
+            (output.queries.boxes[image, :count].cpu() * shares).double().numpy(),
+            output.translation[image, :count].double().cpu().numpy(),
+            rotation_matrices(output.rotation[image, :count]).double().cpu().numpy(),
+            covariances_of(output, image, count, self.config.variance_scale),
+            seconds,
+        )
+
+    def _compare_cameras(self, picture: Picture) -> None:
+        size = picture.pixels.shape[1], picture.pixels.shape[0]
+        trained = self.config.image_size
+        if self._warned or trained is None or self.config.network.needs_intrinsics or size == trained:
+            return
+        self._warned = True
+        warnings.warn(
+            f"images of {size[0]}x{size[1]} for a network trained on {trained[0]}x{trained[1]}: without intrinsics it"
+            " knows the camera it was trained with alone",
+            stacklevel=3,
+        )
+
+
+def covariances_of(output: PoseOutput, image: int, count: int, scale: tuple[float, float]) -> Array | None:
+    """Return (n, 6, 6) covariances of [e_r, e_t] of an image's real queries, None where the network tells none."""
+    if output.translation_uncertainty is None or output.rotation_uncertainty is None:
+        return None
+    result = np.zeros((count, 6, 6))
+    for rows, numbers, factor in (
+        (slice(3, 6), output.translation_uncertainty, scale[0]),
+        (slice(0, 3), output.rotation_uncertainty, scale[1]),
+    ):
+        result[:, rows, rows] = covariance_matrices(numbers[image, :count].double()).cpu().numpy() * factor
+    return result
+
+
+def _load(options: DetectOptions) -> tuple[PoET, ModelConfig]:
+    if options.weights is not None:
+        network, config = load_model(options.weights)
+        if config.detector is None:
+            raise InputError("has no detector", path=options.weights, fix="convert a checkpoint that holds one")
+        return network, replace(config)
+    from poet_loc.model.embedded import load_embedded
+
+    return load_embedded()

@@ -1,0 +1,41 @@
+"""What to look at, with which network, and what to write."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+Engine = Literal["fast", "bfloat16", "eager"]
+
+
+@dataclass(frozen=True)
+class DetectOptions:
+    """How images become object poses."""
+
+    weights: Path | None = None
+    """Network (.safetensors); without it the embedded one."""
+    exported: Path | None = None
+    """Exported pose network (.onnx or .xml) that is run instead; `weights` still has detector and configuration."""
+    engine: Engine = "fast"
+    """fast: fused path for CPUs; bfloat16: the same at half width, less exact; eager: plain torch, also on a GPU."""
+    device: str = "cpu"
+    """cpu or cuda; a GPU takes engine eager."""
+    batch: int = 1
+    """Images at a time."""
+    score: float = 0.0
+    """Detections below this score are dropped."""
+    boxes: Path | None = None
+    """Boxes and classes from elsewhere instead of the detector's: csv with image,x1,y1,x2,y2,score,class (px)."""
+    stamps: Path | None = None
+    """frames.csv with the stamps of the images, if it does not lie in the folder."""
+    rate: float = 30.0
+    """Hz, for images without stamps: frame k gets k / rate."""
+    intrinsics: tuple[float, float, float, float] | None = None
+    """fx, fy, cx, cy (px); else those of the log's calibration.yaml, else of the camera of the training images."""
+    scene: int = 0
+    """Scene number in the BOP results."""
+    overlays: bool = False
+    """Draw boxes and axes into copies of the images."""
+    axis_m: float = 0.05
+    """Length of the drawn axes."""
