@@ -7,6 +7,7 @@ the files of a log a folder has those of a BOP scene: rgb/, scene_camera.json, s
 from __future__ import annotations
 
 import shutil
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -21,6 +22,8 @@ if TYPE_CHECKING:
     from poet_loc.core.records import LandmarkMap
     from poet_loc.data.world.sensor import Sensor
     from poet_loc.data.world.view import Assets, Scene
+    from poet_loc.detect.estimator import Sighting
+    from poet_loc.detect.options import DetectOptions
     from poet_loc.io.log_folder import Log
 
 
@@ -181,3 +184,35 @@ def _sensor_of_video(mean_light: float, rng: np.random.Generator) -> Sensor:
     exposure = 0.22 / max(mean_light, 0.02) * np.exp(rng.normal(0.0, 0.15))
     blur, noise = min(sensor.blur, 0.6), min(sensor.noise, 0.02)
     return replace(sensor, exposure=float(exposure), blur=blur, noise=noise, quality=90)
+
+
+def log_from_pixels(options: VideoOptions, number: int = 0, detection: DetectOptions | None = None) -> Log:
+    """Render a video, detect its objects with the embedded network, and return the log, object_poses.csv included.
+
+    This is the demonstration's world: nothing in the poses comes from anywhere but the pixels.
+    """
+    from poet_loc.data.render import show_progress
+    from poet_loc.data.world.bop_writer import write_models
+    from poet_loc.data.world.view import load_assets
+    from poet_loc.detect.options import DetectOptions
+    from poet_loc.detect.outputs import object_poses
+    from poet_loc.detect.stage import sightings
+    from poet_loc.io.frames_csv import read_frames
+    from poet_loc.io.log_folder import read_log
+    from poet_loc.io.object_poses_csv import write_object_poses
+
+    write_models(options.out / "models", load_assets(options.world_seed).objects)
+    folder = video_folder(options, number)
+    if not folder.exists():
+        render_video(options, number)
+    found: list[Sighting] = []
+
+    def collect() -> Iterator[None]:
+        for sighting in sightings(folder, detection or DetectOptions()):
+            found.append(sighting)
+            yield
+
+    count = len(read_frames(folder / "frames.csv"))
+    show_progress(collect(), count, 0, "frames", options.progress, "detecting")
+    write_object_poses(folder / "object_poses.csv", object_poses(found))
+    return read_log(folder)

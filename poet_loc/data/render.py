@@ -99,11 +99,13 @@ def render_scene(options: RenderOptions, number: int, count: int) -> int:
     return number
 
 
-def show_progress(done: Iterable[object], total: int, already: int, noun: str, visible: bool) -> None:
+def show_progress(
+    done: Iterable[object], total: int, already: int, noun: str, visible: bool, verb: str = "rendering"
+) -> None:
     """Draw a bar while `done` yields one result after the other."""
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-    columns = (TextColumn("rendering"), BarColumn(), MofNCompleteColumn(), TextColumn(noun), TimeRemainingColumn())
+    columns = (TextColumn(verb), BarColumn(), MofNCompleteColumn(), TextColumn(noun), TimeRemainingColumn())
     with Progress(*columns, disable=not visible) as progress:
         task = progress.add_task(noun, total=total, completed=already)
         for _ in done:

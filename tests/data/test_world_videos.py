@@ -8,6 +8,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+import torch
 
 from poet_loc.core.input_error import InputError
 from poet_loc.io.bop import read_bop_scene
@@ -16,7 +17,7 @@ from poet_loc.io.frames_csv import read_frames
 from poet_loc.io.imu_csv import read_imu
 from poet_loc.io.landmarks_json import read_landmarks
 from poet_loc.io.tum import read_tum
-from poet_loc.videos import VideoOptions, render_videos
+from poet_loc.videos import VideoOptions, log_from_pixels, render_videos
 
 
 def options(out: Path, **changes) -> VideoOptions:
@@ -90,3 +91,25 @@ def test_senseless_options_are_refused(tmp_path):
         render_videos(options(tmp_path, objects=(4, 11)))
     with pytest.raises(InputError):
         render_videos(options(tmp_path, duration_s=(5.0, 3.0)))
+
+
+def test_a_log_from_pixels_has_the_poses_that_the_network_gave(tmp_path):
+    from poet_loc.detect.options import DetectOptions
+    from poet_loc.model.checkpoint import ModelConfig, save_model
+    from poet_loc.model.options import NetworkOptions
+    from poet_loc.model.poet import PoET
+    from poet_loc.model.small_detector import SmallDetector, SmallDetectorOptions
+
+    small = SmallDetectorOptions(widths=(8, 8, 16, 16), blocks=(0, 0, 0, 0), pyramid_dim=12, score_threshold=0.001)
+    network = NetworkOptions(
+        32, 4, 1, 1, 32, levels=3, map_channels=(16, 16, 16), class_count=10, translation="ray", uncertainty="aleatoric"
+    )
+    torch.manual_seed(0)
+    weights = tmp_path / "random.safetensors"
+    save_model(weights, PoET(network, SmallDetector(small)), ModelConfig(network, small))
+    log = log_from_pixels(options(tmp_path, objects=(10, 10)), detection=DetectOptions(weights))
+    poses = log.detections()[1]
+    assert len(poses) > 0
+    assert set(poses.stamps_ns) <= set(log.frames.stamps_ns)
+    assert np.all(poses.T_cam_obj.translation[:, 2] > 0)
+    assert poses.covariances.shape == (len(poses), 6, 6)
