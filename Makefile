@@ -8,7 +8,7 @@ export PIP_DISABLE_PIP_VERSION_CHECK = 1
 .PHONY: setup demo test lint types bench docs clean
 
 demo: .venv/core.stamp
-	$(BIN)/poet-loc demo --out runs/demo
+	$(BIN)/poet-loc demo --out runs/demo --overwrite
 
 test: .venv/test.stamp
 	$(BIN)/python -m pytest -n 2 --dist loadfile
