@@ -219,6 +219,42 @@ def _turn_rows_and_columns(P: Array, n: int, G: Array, scratch: Array) -> None:
 
 
 @njit(cache=True)
+def adopt_object(
+    x: Array, P: Array, H: Array, columns: Ints, count: int, R: Array, k: int, layout: Ints, work: Array
+) -> None:
+    """Take an object whose pose was unknown into the state, where a detection with zero residual has put it.
+
+    With 0 = H_x dx + H_o do + e its error is do = -H_o^-1 (H_x dx + e), so that P_o. = -H_o^-1 H_x P_x. and
+    P_oo = H_o^-1 (H_x P H_x^T + R) H_o^-T; H_o is a rotation in either half. work holds 6 n + 36 floats.
+    """
+    n, at = layout[N_ERROR], layout[AT_OBJECTS] + 6 * k
+    for i in range(6):
+        for j in range(n):
+            P[at + i, j] = P[j, at + i] = 0.0
+    PHt, S = work[: 6 * n].reshape((6, n)), work[6 * n : 6 * n + 36].reshape((6, 6))
+    innovation(P, H, columns, count, R, n, PHt, S)
+    first = 0
+    while columns[first] != at:
+        first += 1
+    for half in range(2):
+        for i in range(3):
+            for j in range(n):
+                total = 0.0
+                for r in range(3):
+                    total += H[3 * half + r, first + 3 * half + i] * PHt[3 * half + r, j]
+                P[at + 3 * half + i, j] = P[j, at + 3 * half + i] = -total
+    for a in range(6):
+        for b in range(6):
+            total = 0.0
+            for r in range(3):
+                for s in range(3):
+                    left = H[3 * (a // 3) + r, first + a]
+                    right = H[3 * (b // 3) + s, first + b]
+                    total += left * S[3 * (a // 3) + r, 3 * (b // 3) + s] * right
+            P[at + a, at + b] = total
+
+
+@njit(cache=True)
 def inject(x: Array, error: Array, layout: Ints, scratch: Array) -> None:
     """Move the nominal state by an error state, in place (`nav_state.retract_state`)."""
     _turn(x, 0, error, 0, scratch)

@@ -28,6 +28,7 @@ from fusion.eskf import (
     POSITION_ONLY,
     REJECTED,
     ROTATION_ONLY,
+    adopt_object,
     bias_sigma,
     correct,
     decay_biases,
@@ -58,6 +59,7 @@ from fusion.memory import (
 from fusion.nav_state import (
     AT_BIASES,
     AT_GRAVITY,
+    AT_OBJECTS,
     BIASES,
     EXTRINSIC_POSITION,
     EXTRINSIC_ROTATION,
@@ -225,6 +227,8 @@ def _update(
     for i in range(6):
         for j in range(6):
             w.R[i, j] = covariance[i, j] * scale
+    if kind == OBJECT_POSE and m.known[k] == 0.0:
+        return _meet_object(m, w, k, R_m, t_m, rate)
     if kind == OBJECT_POSE and m.orders[k] != 1:
         _fit_object_symmetry(m, w, k, R_m, rate)
     count = residual_and_jacobian(
@@ -240,6 +244,31 @@ def _update(
         start = 3 if decision == POSITION_ONLY else 0
         correct(m.x, m.P, w.PHt, w.S, w.residual, start, 3, m.layout, w.L, w.white, w.Z, w.error, w.scratch)
     return decision
+
+
+@njit(cache=True)
+def _meet_object(m: Memory, w: Work, k: int, R_m: Array, t_m: Array, rate: Array) -> int:
+    """Place an object whose pose in the world is unknown where its first detection sees it."""
+    if m.layout[AT_OBJECTS] < 0:
+        return REJECTED
+    R_wi, R_wc, p_wi, away = w.step[0:9], w.step[9:18], w.step[18:21], w.step[30:33]
+    camera_in_world(m.x, m.x[TIME_OFFSET] - m.limits[NOMINAL_OFFSET], rate, R_wi, p_wi, R_wc, w.step[21:30])
+    at = OBJECTS + OBJECT_SIZE * k
+    multiply(R_wc, R_m, m.x[at : at + 9])
+    apply(R_wc, t_m[0], t_m[1], t_m[2], away)
+    p_ic = m.x[EXTRINSIC_POSITION : EXTRINSIC_POSITION + 3]
+    apply(R_wi, p_ic[0], p_ic[1], p_ic[2], w.step[33:36])
+    for i in range(3):
+        m.x[at + 9 + i] = p_wi[i] + w.step[33 + i] + away[i]
+    if m.layout[N_BIAS_KINDS] > 0:
+        for first in (0, 3):
+            forget_bias(m.x, m.P, k, first, m.bias_model, m.layout)
+    count = residual_and_jacobian(
+        OBJECT_POSE, k, R_m, t_m, m.x, rate, m.limits[NOMINAL_OFFSET], m.layout, w.residual, w.H, m.columns, w.step
+    )
+    adopt_object(m.x, m.P, w.H, m.columns, count, w.R, k, m.layout, w.objects)
+    m.known[k] = 1.0
+    return ACCEPTED
 
 
 @njit(cache=True)
@@ -275,7 +304,7 @@ def _fit_object_symmetry(m: Memory, w: Work, k: int, R_m: Array, rate: Array) ->
 @njit(cache=True)
 def _vote(m: Memory, w: Work, kind: int, k: int, rotation: Array, translation: Array, decision: int) -> None:
     """Remember where a measurement puts the imu. A symmetric object does not say which way it is turned: no vote."""
-    if kind == OBJECT_POSE and m.orders[k] != 1:
+    if kind == OBJECT_POSE and (m.orders[k] != 1 or m.known[k] == 0.0):
         return
     slot = m.counters[VOTE_HEAD] % len(m.vote_stamps)
     vote = m.votes[slot]

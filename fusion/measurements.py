@@ -92,16 +92,19 @@ def viewing_axes(translations: Array) -> Array:
     return np.stack([across_x, np.cross(along, across_x), along], axis=-1)
 
 
-def ray_aligned_covariance(translations: Array, across: float, along: float, rotation: float) -> Array:
+def ray_aligned_covariance(
+    translations: Array, across: float, along: float, rotation: float, floor: float = 0.0
+) -> Array:
     """Return (N, 6, 6) covariances of object poses that err mostly along the viewing ray.
 
-    translations (N, 3) in m; across and along: 1-sigma as a share of the distance; rotation: 1-sigma in rad per axis.
+    translations (N, 3) in m; across and along: 1-sigma as a share of the distance; rotation: 1-sigma in rad per axis;
+    floor: 1-sigma (m) in every direction beside them.
     """
     axes = viewing_axes(translations)
     sigma = np.linalg.norm(translations, axis=-1)[:, None] * np.array([across, across, along])
     covariances = np.zeros((len(translations), 6, 6))
     covariances[:, :3, :3] = rotation**2 * np.eye(3)
-    covariances[:, 3:, 3:] = (axes * sigma[:, None, :] ** 2) @ np.swapaxes(axes, 1, 2)
+    covariances[:, 3:, 3:] = (axes * (sigma[:, None, :] ** 2 + floor**2)) @ np.swapaxes(axes, 1, 2)
     return covariances
 
 

@@ -28,6 +28,7 @@ INITIALISING, TRACKING = 0, 1
     AT_P,
     AT_SCALES,
     AT_REFUSED,
+    AT_KNOWN,
     AT_UP,
     END_OF_STATE,
     AT_NOISE,
@@ -48,7 +49,7 @@ INITIALISING, TRACKING = 0, 1
     AT_VOTE_STAMPS,
     AT_INLIERS,
     HEADER,
-) = range(24)
+) = range(25)
 
 
 class Memory(NamedTuple):
@@ -58,6 +59,7 @@ class Memory(NamedTuple):
     P: Array
     scales: Array  # (K,) how much larger than stated each object's noise has shown itself
     refused: Array  # (K, 2) how often in a row each object's rotation and position were refused
+    known: Array  # (K,) 1 where an object's pose in the world is known, 0 before it was first seen
     up: Array  # (3,) running mean of the specific force in the axes of the integrated motion
     noise: Array
     limits: Array  # places: filter_loop.LIMIT_BOTH and following
@@ -85,6 +87,7 @@ def allocate(layout: StateLayout) -> tuple[Array, Ints]:
         (AT_P, n * n),
         (AT_SCALES, max(K, 1)),
         (AT_REFUSED, 2 * max(K, 1)),
+        (AT_KNOWN, max(K, 1)),
         (AT_UP, 3),
         (END_OF_STATE, 0),
         (AT_NOISE, 8),
@@ -123,7 +126,26 @@ def allocate(layout: StateLayout) -> tuple[Array, Ints]:
 @njit(cache=True)
 def work_size(n: int) -> int:
     """Return how many floats of work space a filter with n error states needs."""
-    return 256 + 45 + 6 + 17 * CORE + 3 * n + 6 + 6 * MAX_COLUMNS + 6 * n + 36 + 36 + 36 + 6 + 6 * n + n + 12 + 128
+    return (
+        256
+        + 45
+        + 6
+        + 17 * CORE
+        + 3 * n
+        + 6
+        + 6 * MAX_COLUMNS
+        + 6 * n
+        + 36
+        + 36
+        + 36
+        + 6
+        + 6 * n
+        + n
+        + 12
+        + 128
+        + 6 * n
+        + 36
+    )
 
 
 @njit(cache=True)
@@ -137,6 +159,7 @@ def views(floats: Array, integers: Ints) -> Memory:
         f[i[AT_P] : i[AT_P] + n * n].reshape((n, n)),
         f[i[AT_SCALES] : i[AT_SCALES] + K],
         f[i[AT_REFUSED] : i[AT_REFUSED] + 2 * K].reshape((K, 2)),
+        f[i[AT_KNOWN] : i[AT_KNOWN] + K],
         f[i[AT_UP] : i[AT_UP] + 3],
         f[i[AT_NOISE] : i[AT_NOISE] + 8],
         f[i[AT_LIMITS] : i[AT_LIMITS] + 8],
@@ -174,6 +197,7 @@ class Work(NamedTuple):
     error: Array
     measured: Array  # R_m (9), t_m (3)
     scratch: Array
+    objects: Array  # (6 n + 36,)
 
 
 @njit(cache=True)
@@ -211,4 +235,5 @@ def work_views(work: Array, n: int) -> Work:
         work[q:r],
         work[r:s],
         work[s : s + 128],
+        work[s + 128 :],
     )

@@ -14,6 +14,8 @@ class DetectionNoise:
     """1-sigma across the ray, as a share of the distance."""
     along: float = 0.018
     """1-sigma along the ray, as a share of the distance."""
+    floor: float = 0.006
+    """1-sigma of position in every direction beside that, m: what stays of the error near an object."""
     rotation_deg: float = 3.0
     """1-sigma of rotation per axis, deg."""
 
@@ -128,6 +130,25 @@ class Prior:
     """Camera-IMU time offset where it is estimated, s."""
     gravity_deg: float = 2.0
     """Direction of gravity where it is estimated, deg."""
+    map_position: float = 0.05
+    """Landmark position of an approximate map without covariances, m."""
+    map_rotation_deg: float = 5.0
+    """Landmark rotation of an approximate map without covariances, deg per axis."""
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """What is estimated beside motion and IMU biases."""
+
+    extrinsics: bool = False
+    """Where the camera sits on the IMU."""
+    time_offset: bool = False
+    """The camera's time offset against the IMU, beside the calibration's."""
+    gravity: bool = False
+    """The direction of gravity in the world."""
+    map: Literal["known", "approximate", "unknown"] = "known"
+    """Object poses: known as they are in the map; approximate: the map with its covariances (or the priors below);
+    unknown: only the first landmark of the map, which anchors the world, the others where they are first seen."""
 
 
 @dataclass(frozen=True)
@@ -178,5 +199,6 @@ class FuseOptions:
     gate: Gate = field(default_factory=Gate)
     start: Start = field(default_factory=Start)
     prior: Prior = field(default_factory=Prior)
+    estimate: Estimate = field(default_factory=Estimate)
     gap: Gap = field(default_factory=Gap)
     graph: Graph = field(default_factory=Graph)

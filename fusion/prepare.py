@@ -98,7 +98,7 @@ def object_measurements(
     poses, landmark = poses[order], landmark[order]
     noise = options.noise
     t = poses.T_cam_obj.translation
-    covariances = ray_aligned_covariance(t, noise.across, noise.along, math.radians(noise.rotation_deg))
+    covariances = ray_aligned_covariance(t, noise.across, noise.along, math.radians(noise.rotation_deg), noise.floor)
     if poses.covariances is not None:
         given = np.isfinite(poses.covariances).all(axis=(1, 2))
         covariances[given] = poses.covariances[given]
@@ -137,9 +137,16 @@ def time_shift_ns(calibration: Calibration) -> int:
 
 def layout_for(landmark_map: LandmarkMap | None, options: FuseOptions) -> StateLayout:
     """Return which states the options ask for."""
-    if options.measurements == "camera" or landmark_map is None:
-        return StateLayout()
-    return StateLayout(n_objects=len(landmark_map), bias_kinds=_bias_kinds(options.bias))
+    estimate = options.estimate
+    objects = options.measurements == "objects" and landmark_map is not None
+    return StateLayout(
+        n_objects=len(landmark_map) if objects and landmark_map is not None else 0,
+        extrinsics=estimate.extrinsics,
+        time_offset=estimate.time_offset,
+        gravity=estimate.gravity,
+        objects=objects and estimate.map != "known",
+        bias_kinds=_bias_kinds(options.bias) if objects else 0,
+    )
 
 
 def _bias_kinds(bias: DetectionBias) -> int:
@@ -182,6 +189,9 @@ def fill_memory(problem: Problem, options: FuseOptions) -> tuple[Array, NDArray[
     steady[eskf.BIAS_ROTATION] = math.radians(bias.steady_rotation_deg)
     steady[[eskf.BIAS_ACROSS, eskf.BIAS_ALONG, eskf.BIAS_TAU]] = bias.steady_across, bias.steady_along, math.inf
     m.prior[:] = _prior(layout, options)
+    m.known[:] = 1.0
+    if options.estimate.map == "unknown":
+        m.known[1:] = 0.0
     if landmark_map is not None and layout.n_objects:
         for k, landmark in enumerate(landmark_map):
             if landmark.symmetry is not None:
@@ -227,10 +237,22 @@ def _start(options: FuseOptions) -> list[float]:
 
 
 def _prior(layout: StateLayout, options: FuseOptions) -> Array:
+    """Return the 1-sigma of the error state at the start; of object poses where the map brings no covariance."""
     prior, sigma = options.prior, np.zeros(layout.n_error)
     sigma[0:3] = math.radians(prior.attitude_deg)
     sigma[3:6] = prior.position
     sigma[6:9] = prior.velocity
     sigma[9:12] = prior.gyroscope_bias
     sigma[12:15] = prior.accelerometer_bias
+    if layout.extrinsics:
+        rotation = math.radians(prior.extrinsic_rotation_deg)
+        sigma[layout.error_slice("extrinsics")] = np.r_[[rotation] * 3, [prior.extrinsic_position] * 3]
+    if layout.time_offset:
+        sigma[layout.error_slice("time_offset")] = prior.time_offset
+    if layout.gravity:
+        sigma[layout.error_slice("gravity")] = math.radians(prior.gravity_deg)
+    if layout.objects and options.estimate.map == "approximate":
+        for k in range(layout.n_objects):
+            rotation = math.radians(prior.map_rotation_deg)
+            sigma[layout.error_slice("objects", k)] = np.r_[[rotation] * 3, [prior.map_position] * 3]
     return sigma
