@@ -24,6 +24,7 @@ COMMANDS = {
     "evaluate": "errors of a trajectory against a reference, per axis, APE and RPE",
     "table": "the localisation table of one log or several: detections x modes",
     "convert": "bring data from other formats into a log folder",
+    "model-card": "figures of a checkpoint on rendered test videos",
     "render": "images or videos of the rendered household world",
     "simulate": "write a simulated log folder, or run many simulated logs through the estimators",
     "view": "open the recording of a run in rerun",

@@ -10,12 +10,14 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import RigidTransform
 
+from poet_loc.core.input_error import InputError
 from poet_loc.core.object_errors import add_s, area_under_curve
 from poet_loc.core.records import ObjectPoses
 from poet_loc.data.packed import ObjectModels, load_models
 from poet_loc.io.bop import BopScene, read_bop_scene
 from poet_loc.io.frames_csv import read_frames
 from poet_loc.model.checkpoint import load_model
+from poet_loc.model.embedded import EMBEDDED_WEIGHTS
 from poet_loc.train.average_precision import mean_average_precision
 from poet_loc.train.video_poses import Boxes, poses_of_video, true_boxes
 
@@ -26,10 +28,10 @@ Array = NDArray[np.float64]
 class MeasureOptions:
     """Which checkpoint to measure on which videos."""
 
-    weights: Path
-    """Checkpoint (safetensors)."""
     videos: Path
-    """Folder of rendered videos, with models/."""
+    """Folder of rendered videos, with models/ (poet-loc render videos)."""
+    weights: Path = EMBEDDED_WEIGHTS
+    """Checkpoint (safetensors); without it the embedded one."""
     write_poses: bool = True
     """Write object_poses_bb.csv and object_poses_gt.csv into the videos' folders."""
     least_visible: float = 0.1
@@ -72,13 +74,16 @@ def measure(options: MeasureOptions) -> Figures:
     from poet_loc.data.world.objects import household_objects
     from poet_loc.io.object_poses_csv import write_object_poses
 
+    folders = sorted(path.parent for path in options.videos.glob("*/frames.csv"))
+    if not folders:
+        raise InputError("has no rendered videos", path=options.videos, fix="poet-loc render videos --out FOLDER")
     network, config = load_model(options.weights)
     models = load_models(options.videos / "models")
     names = {int(k): v for k, v in json.loads((options.videos / "models" / "names.json").read_text()).items()}
     parts: dict[Boxes, list[PoseScores]] = {"bb": [], "gt": []}
     detections: list[Array] = []
     truth: list[Array] = []
-    for folder in sorted(path.parent for path in options.videos.glob("*/frames.csv")):
+    for folder in folders:
         scene, frames = read_bop_scene(folder), read_frames(folder / "frames.csv")
         found = poses_of_video(network, config, folder)
         for kind, poses in found.poses.items():
