@@ -169,7 +169,7 @@ def top_view_figure(record: RunRecord) -> Figure:
         panel.set_xlabel("x [m]")
         panel.set_title(f"{_BODY_NAMES[body]} (circle: start, square: end)", loc="left")
     axes[0, 0].set_ylabel("y [m]")
-    figure.suptitle("From above", fontsize=9)
+    figure.suptitle("From above, with the landmarks as diamonds", fontsize=9)
     handles: dict[str, Any] = {}
     for panel in axes[0]:
         handles |= {text: handle for handle, text in zip(*panel.get_legend_handles_labels(), strict=True)}
@@ -233,7 +233,6 @@ def landmark_figure(record: RunRecord, decisions: Decisions, name: str) -> Figur
     panel.set_ylim(len(lanes) - 0.5, -0.5)
     panel.grid(axis="y", visible=False)
     panel.set_xlabel(_TIME)
-    panel.set_ylabel("landmark [-]")
     figure.suptitle(f"{name}: which landmark was seen when, and used or refused", fontsize=9)
     legend_below(figure, panel)
     return figure
@@ -308,7 +307,7 @@ def _square_limits(panel: Axes, trajectory: Trajectory, record: RunRecord) -> No
 def _draw_landmarks(panel: Axes, record: RunRecord) -> None:
     for landmark in record.landmark_map or ():
         x, y = landmark.T_world_obj.translation[:2]
-        panel.plot(x, y, "D", color=ORANGE, markersize=4, zorder=25)
+        panel.plot(x, y, "D", color=TRUTH, markerfacecolor="white", markersize=4, zorder=25)
         text = record.landmark_label(*landmark.key)
         panel.annotate(text, (x, y), xytext=(4, 3), textcoords="offset points", fontsize=6, color=TRUTH, zorder=26)
 

@@ -6,7 +6,7 @@ Everything is sent by columns, never an entity a pose; long logs are thinned. Th
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -29,6 +29,8 @@ Colour = tuple[int, int, int]
 TIMELINE = "sensor_time"
 MAX_ROWS = 20_000
 """Longest column of one entity; longer ones are thinned evenly."""
+MAX_RATE_HZ = 50.0
+"""Poses and states at a higher rate are thinned to it."""
 
 _TRUTH: Colour = (230, 230, 230)
 _ORACLE: Colour = (150, 150, 150)
@@ -133,7 +135,7 @@ def _log_ellipsoids(recording: rr.RecordingStream, entity: str, estimate: Estima
     """The 3-sigma ellipsoid of the position at each pose."""
     if estimate.pose_covariances is None or len(estimate.trajectory) == 0:
         return
-    step = _step(len(estimate.trajectory))
+    step = _step(estimate.trajectory.stamps_ns)
     covariances = estimate.pose_covariances[::step, 3:, 3:]
     known = np.flatnonzero(np.isfinite(covariances).all(axis=(1, 2)))
     if len(known) == 0:
@@ -153,7 +155,7 @@ def _log_ellipsoids(recording: rr.RecordingStream, entity: str, estimate: Estima
 
 def _log_errors(recording: rr.RecordingStream, row: Row, colour: Colour) -> None:
     """Each axis's error as a line, its 3-sigma as a band about zero, and the NEES."""
-    step = _step(len(row.stamps_ns))
+    step = _step(row.stamps_ns)
     time = _time(row.stamps_ns[::step])
     for axis, unit, error in zip(ERROR_AXES, _UNITS, row.errors[::step].T, strict=True):
         entity = f"errors/{axis}/{row.name}"
@@ -176,7 +178,7 @@ def _log_errors(recording: rr.RecordingStream, row: Row, colour: Colour) -> None
 
 def _log_states(recording: rr.RecordingStream, fused: Fused) -> None:
     """Biases and velocity with their 3-sigma bands."""
-    step = _step(len(fused.stamps_ns))
+    step = _step(fused.stamps_ns)
     time = _time(fused.stamps_ns[::step])
     states = (
         ("gyroscope_bias", fused.gyroscope_bias, slice(9, 12), "rad/s"),
@@ -190,7 +192,7 @@ def _log_states(recording: rr.RecordingStream, fused: Fused) -> None:
         entity = f"states/{fused.name}/{state}"
         _send_measurements(recording, entity, time, values[::step], variances, names, colours)
     if fused.gate is not None:
-        step = _step(len(fused.gate.stamps_ns))
+        step = _step(fused.gate.stamps_ns)
         time = _time(fused.gate.stamps_ns[::step])
         parts = (("position", fused.gate.nis_position, _PALETTE[0]), ("rotation", fused.gate.nis_rotation, _PALETTE[4]))
         for part, nis, colour in parts:
@@ -218,7 +220,7 @@ def _log_detections(recording: rr.RecordingStream, record: RunRecord) -> None:
     if detections is None or len(detections) == 0 or "cam" not in record.references:
         return
     frames_ns = np.unique(detections.stamps_ns)
-    detections = detections[np.isin(detections.stamps_ns, frames_ns[:: _step(len(frames_ns))])]
+    detections = detections[np.isin(detections.stamps_ns, frames_ns[:: _step(frames_ns)])]
     stamps_ns, counts = np.unique(detections.stamps_ns, return_counts=True)  # sorted, as detections are
     _, kinds = np.unique(detections.object_ids, return_inverse=True)
     colours = np.array(_PALETTE)[kinds % len(_PALETTE)]
@@ -229,9 +231,8 @@ def _log_detections(recording: rr.RecordingStream, record: RunRecord) -> None:
 
 
 def _blueprint(record: RunRecord) -> rrb.Blueprint:
-    names = [estimate.name for estimate in record.estimates]
-    shown = [name for name in names if not name.startswith("localize/") or name == "localize/robust"] or names
-    hidden = [name for name in names if name not in shown]
+    names = sorted((estimate.name for estimate in record.estimates), key=_rank)
+    hidden = [name for name in names[1:] if name.startswith("localize/") and name != "localize/robust"]
     world = rrb.Spatial3DView(
         origin="world",
         name="world",
@@ -239,17 +240,16 @@ def _blueprint(record: RunRecord) -> rrb.Blueprint:
         line_grid=rrb.LineGrid3D(spacing=0.1),
         eye_controls=_eye(record),
     )
+    rows = sorted(record.evaluation.rows if record.evaluation else (), key=lambda row: _rank(row.name))
     tabs: list[Any] = []
-    if record.evaluation is not None:
-        tabs += [
-            _error_views(ERROR_AXES[:3], "position error", hidden),
-            _error_views(ERROR_AXES[3:], "attitude error", hidden),
-        ]
-    for fused in record.fused:
+    if rows:
+        tabs.append(_error_views(rows, ERROR_AXES[:3], "position error"))
+        tabs.append(_error_views(rows, ERROR_AXES[3:], "attitude error"))
+    for fused in sorted(record.fused, key=lambda fused: _rank(fused.name)):
         states = ("gyroscope_bias", "accelerometer_bias", "velocity")
         views = [rrb.TimeSeriesView(origin=f"states/{fused.name}/{state}", name=state) for state in states]
         tabs.append(rrb.Vertical(*views, name=f"states of {fused.name}"))
-    consistent = {row.name for row in (record.evaluation.rows if record.evaluation else ()) if row.nees is not None}
+    consistent = {row.name for row in rows if row.nees is not None and row.name not in hidden}
     consistent |= {fused.name for fused in record.fused if fused.gate is not None}
     views = [
         rrb.TimeSeriesView(origin=f"consistency/{name}", name=name, axis_y=rrb.ScalarAxis(range=(0.0, 8.0)))
@@ -257,12 +257,19 @@ def _blueprint(record: RunRecord) -> rrb.Blueprint:
         if name in consistent
     ]
     tabs += [rrb.Vertical(*views, name="consistency")] if views else []
-    lanes = [rrb.StateTimelineView(origin=f"decisions/{name}", name=f"seen by {name}") for name in record.decisions]
-    column = [rrb.Tabs(*tabs)] if tabs else []
-    column += [rrb.Tabs(*lanes[::-1])] if lanes else []
+    lanes = [
+        rrb.StateTimelineView(origin=f"decisions/{name}", name=f"used by {name}")
+        for name in sorted(record.decisions, key=_rank)
+    ]
+    column = [rrb.Tabs(*part) for part in (tabs, lanes) if part]
     shares = [2, 1][: len(column)]
     layout = rrb.Horizontal(world, rrb.Vertical(*column, row_shares=shares), column_shares=[3, 2]) if column else world
     return rrb.Blueprint(layout, rrb.TimePanel(timeline=TIMELINE, expanded=False), collapse_panels=True)
+
+
+def _rank(name: str) -> tuple[bool, bool, bool]:
+    """Estimates in the order of interest: fused before localised, tightly coupled and robust ones first."""
+    return name.startswith("localize/"), not name.endswith(("/objects", "/robust")), name == "localize/best"
 
 
 def _eye(record: RunRecord) -> rrb.EyeControls3D | None:
@@ -278,17 +285,25 @@ def _eye(record: RunRecord) -> rrb.EyeControls3D | None:
     return rrb.EyeControls3D(position=position, look_target=centre, eye_up=(0.0, 0.0, 1.0))
 
 
-def _error_views(axes: Sequence[str], name: str, hidden: Iterable[str]) -> rrb.Vertical:
-    hide = list(hidden)
-    views = [
-        rrb.TimeSeriesView(
+def _error_views(rows: Sequence[Row], axes: Sequence[str], name: str) -> rrb.Vertical:
+    """The first row with its band and the robust localisation as a line; the others are a click away."""
+    first, others = rows[0], [row.name for row in rows[1:]]
+    views = []
+    for axis in axes:
+        hidden = [f"{other}/3_sigma" if other == "localize/robust" else other for other in others]
+        k = ERROR_AXES.index(axis)
+        usual = [np.percentile(np.abs(first.errors[:, k]), 99)] if len(first.errors) else [1e-3]
+        if first.sigmas is not None and np.isfinite(first.sigmas[:, k]).any():
+            usual.append(3.0 * np.nanmedian(first.sigmas[:, k]))
+        limit = 1.5 * float(_in_unit(np.max(usual), _UNITS[k]))
+        view = rrb.TimeSeriesView(
             origin=f"errors/{axis}",
-            name=f"{axis} and ±3σ",
+            name=f"{axis} and ±3σ of {first.name}",
+            axis_y=rrb.ScalarAxis(range=(-limit, limit)),
             plot_legend=rrb.PlotLegend(corner=rrb.Corner2D.LeftTop, visible=axis == axes[0]),
-            overrides={f"errors/{axis}/{estimate}": rrb.EntityBehavior(visible=False) for estimate in hide},
+            overrides={f"errors/{axis}/{entity}": rrb.EntityBehavior(visible=False) for entity in hidden},
         )
-        for axis in axes
-    ]
+        views.append(view)
     return rrb.Vertical(*views, name=name)
 
 
@@ -351,11 +366,15 @@ def _unbroken(trajectory: Trajectory) -> list[Trajectory]:
 
 
 def _thinned(trajectory: Trajectory) -> Trajectory:
-    return trajectory[:: _step(len(trajectory))]
+    return trajectory[:: _step(trajectory.stamps_ns)]
 
 
-def _step(rows: int) -> int:
-    return 1 + (rows - 1) // MAX_ROWS if rows else 1
+def _step(stamps_ns: Stamps) -> int:
+    """Every which row is enough for the eye."""
+    if len(stamps_ns) < 2:
+        return 1
+    interval_s = float(np.median(np.diff(stamps_ns))) * 1e-9
+    return max(1 + (len(stamps_ns) - 1) // MAX_ROWS, int(1.001 / (MAX_RATE_HZ * interval_s)) if interval_s else 1, 1)
 
 
 def _time(stamps_ns: Stamps) -> rr.TimeColumn:
@@ -364,8 +383,8 @@ def _time(stamps_ns: Stamps) -> rr.TimeColumn:
     return rr.TimeColumn(TIMELINE, duration=stamps_ns.astype("timedelta64[ns]"))
 
 
-def _in_unit(values: Array, unit: str) -> Array:
-    return values * 1e3 if unit == "mm" else np.degrees(values)
+def _in_unit(values: Any, unit: str) -> Array:
+    return np.asarray(values * 1e3 if unit == "mm" else np.degrees(values))
 
 
 def _colours(estimates: Sequence[Estimate]) -> dict[str, Colour]:

@@ -54,7 +54,9 @@ class RunRecord:
         return found | {fused.name: Decisions.of_gate(fused.gate) for fused in self.fused if fused.gate is not None}
 
     def landmark_label(self, object_id: int, instance: int) -> str:
-        """Return a landmark's name, or its id where it has none."""
+        """Return a landmark's name, or its id where it has none; a negative id stands for a whole camera pose."""
+        if object_id < 0:
+            return "camera pose"
         for landmark in self.landmark_map or ():
             if landmark.key == (object_id, instance) and landmark.name:
                 return f"{landmark.name} #{instance}" if instance else str(landmark.name)
