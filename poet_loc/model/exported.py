@@ -52,7 +52,7 @@ class ExportedPoses:
             one = slice(i, i + 1)
             maps = [m[one] for m in features.maps]
             parts = (position[one], content[one], queries.boxes[one], queries.classes[one], given[one])
-            rows.append(self.run(_arrays((maps, *parts))))
+            rows.append(self.run(graph_arrays((maps, *parts))))
         found = [torch.from_numpy(np.concatenate(column)) for column in zip(*rows)]
         return PoseOutput(found[0], found[1], queries, *(found[2:4] if len(found) == 4 else (None, None)))
 
@@ -67,10 +67,11 @@ def load_graph(path: Path, threads: int | None = None) -> Runner:
 
 def run_graph(path: Path, inputs: Sequence[Any]) -> list[Tensor]:
     """Run a graph once on (maps, position, content, boxes, classes, intrinsics)."""
-    return [torch.from_numpy(np.array(array)) for array in load_graph(path)(_arrays(inputs))]
+    return [torch.from_numpy(np.array(array)) for array in load_graph(path)(graph_arrays(inputs))]
 
 
-def _arrays(inputs: Sequence[Any]) -> list[Any]:
+def graph_arrays(inputs: Sequence[Any]) -> list[Any]:
+    """Return (maps, position, content, boxes, classes, intrinsics) as the arrays that a graph takes, in its order."""
     maps, *rest = inputs
     return [np.ascontiguousarray(tensor.detach().numpy()) for tensor in (*maps, *rest)]
 

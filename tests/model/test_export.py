@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from pathlib import Path
 
 import pytest
@@ -10,7 +11,7 @@ from official_fixture import random_features, randomise, small_options
 
 from poet_loc.core.input_error import InputError
 from poet_loc.model.checkpoint import ModelConfig, save_model
-from poet_loc.model.export import ExportOptions, PoseGraph, export, largest_difference
+from poet_loc.model.export import ExportOptions, PoseGraph, export, largest_difference, write_onnx
 from poet_loc.model.exported import ExportedPoses
 from poet_loc.model.poet import PoET
 from poet_loc.model.queries import queries_from_detections
@@ -18,12 +19,25 @@ from poet_loc.model.queries import queries_from_detections
 pytest.importorskip("onnxscript")
 
 
+@pytest.fixture(scope="module")
+def network() -> PoET:
+    return randomise(PoET(small_options(encoder_layers=1, decoder_layers=1, uncertainty="aleatoric"))).eval()
+
+
+@pytest.fixture(scope="module")
+def onnx_file(network: PoET, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("onnx") / "graph.onnx"
+    write_onnx(PoseGraph(network, (96, 128)), path)
+    return path
+
+
 @pytest.mark.parametrize("suffix", [".onnx", ".xml"])
-def test_graph_is_the_network(suffix: str, tmp_path: Path) -> None:
+def test_graph_is_the_network(
+    suffix: str, network: PoET, onnx_file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     pytest.importorskip("onnxruntime" if suffix == ".onnx" else "openvino")
-    options = small_options(encoder_layers=1, decoder_layers=1, uncertainty="aleatoric")
-    network = randomise(PoET(options)).eval()
-    save_model(tmp_path / "n.safetensors", network, ModelConfig(options, image_size=(128, 96)))
+    monkeypatch.setattr("poet_loc.model.export.write_onnx", lambda graph, path: shutil.copy(onnx_file, path))
+    save_model(tmp_path / "n.safetensors", network, ModelConfig(network.options, image_size=(128, 96)))
     path = export(ExportOptions(tmp_path / "n.safetensors", tmp_path / f"graph{suffix}"))
     assert largest_difference(path, PoseGraph(network, (96, 128)), seed=5) < 1e-4
     engine = ExportedPoses(path, network)

@@ -1,0 +1,341 @@
+"""Object poses of a results file against the truth, class by class: the stage behind `poet-loc evaluate-poses`."""
+
+from __future__ import annotations
+
+import json
+from collections import defaultdict
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import linear_sum_assignment
+from scipy.spatial.transform import RigidTransform
+
+from poet_loc.core.input_error import InputError
+from poet_loc.core.object_errors import (
+    add,
+    add_s,
+    area_under_curve,
+    area_under_curve_published,
+    average_rotation_error,
+    average_translation_error,
+)
+from poet_loc.core.symmetric_errors import (
+    RECALL_PIXELS,
+    RECALL_SHARES,
+    average_recall,
+    axis_tilt,
+    mspd,
+    mssd,
+    rotation_angle_up_to_symmetry,
+    symmetry_transforms,
+    turn_about_axis,
+)
+from poet_loc.io.bop import read_bop_scene
+from poet_loc.io.bop_models import BopModel, read_models_info
+from poet_loc.io.bop_results_csv import BopResults, read_bop_results
+from poet_loc.io.ply import read_model_points
+
+Array = NDArray[np.float64]
+Places = dict[tuple[int, int, int], list[int]]
+
+YCBV_THRESHOLDS_M = (0.02, 0.05, 0.10)
+LMO_THRESHOLDS = (0.02, 0.05, 0.10)
+"""In shares of the diameter."""
+
+
+@dataclass(frozen=True)
+class EvaluatePosesOptions:
+    """What is compared with what."""
+
+    models: Path
+    """Folder of models_info.json and obj_000001.ply, ... (BOP, e.g. models_eval)."""
+    least_visible: float = 0.1
+    """True objects below this visible share do not count."""
+    keyframes: Path | None = None
+    """File of lines like 0048/000001 that restricts the images."""
+    symmetric: tuple[int, ...] = ()
+    """Object ids that ADD(-S) measures by the nearest point; empty: those with a symmetry in models_info.json."""
+    names: Path | None = None
+    """Classes file, object id to name."""
+    points: int = 1000
+    """Model points per object, evenly picked."""
+
+
+@dataclass(frozen=True)
+class ObjectModel:
+    """What the errors of one object need."""
+
+    name: str
+    points: Array
+    """(P, 3) m."""
+    info: BopModel
+    symmetric: bool
+    """Measured by ADD-S in ADD(-S)."""
+
+
+@dataclass(frozen=True)
+class ClassErrors:
+    """Errors of one class: of its matched objects, and what was missed or made up."""
+
+    name: str
+    true: int
+    """Objects that are there."""
+    matched: int
+    missed: int
+    false: int
+    """Estimates without an object."""
+    auc_add: float
+    """Percent, up to 10 cm, the published Simpson rule; likewise the next two."""
+    auc_add_s: float
+    auc_add_or_s: float
+    """ADD(-S): ADD-S for symmetric objects, else ADD."""
+    auc_add_or_s_exact: float
+    """The exact integral."""
+    within_m: tuple[float, ...]
+    """Percent of ADD(-S) below 2, 5, 10 cm."""
+    within_diameter: tuple[float, ...]
+    """Percent of ADD(-S) below 2, 5, 10 % of the diameter."""
+    translation_m: float
+    """Mean distance."""
+    rotation_rad: float
+    """Mean angle."""
+    rotation_reduced_rad: float
+    """Mean angle to the nearest rotation that looks like the true one."""
+    axis_tilt_rad: float
+    """Mean angle between the symmetry axes; NaN without one."""
+    turn_rad: float
+    """Mean turn about the symmetry axis; NaN without one."""
+    recall_mssd: float
+    """BOP's average recall, missed objects counted, percent."""
+    recall_mspd: float
+
+
+@dataclass(frozen=True)
+class PoseEvaluation:
+    """One results file against the truth."""
+
+    name: str
+    classes: tuple[ClassErrors, ...]
+    overall: dict[str, float] = field(default_factory=dict)
+    """Means over the classes (those without an estimate count as 0, as published), and pooled errors."""
+
+    def to_json(self) -> dict[str, object]:
+        """Return all numbers."""
+        return {"name": self.name, "classes": [asdict(c) for c in self.classes], "overall": self.overall}
+
+
+@dataclass(frozen=True)
+class Truth:
+    """The objects that are there, G rows."""
+
+    scene_ids: NDArray[np.int64]
+    image_ids: NDArray[np.int64]
+    object_ids: NDArray[np.int64]
+    T_cam_obj: RigidTransform
+    cameras: Array
+    """(G, 3, 3) of each object's image."""
+    image_width: int
+
+
+def evaluate_poses(results: Sequence[Path], truth: str | Path, options: EvaluatePosesOptions) -> list[PoseEvaluation]:
+    """Compare results files (BOP csv) with a BOP split folder.
+
+    In every image the estimates of an object are assigned to its instances by distance, the best scores first where
+    there are more estimates than instances.  Raises InputError for files that do not fit each other.
+    """
+    there = read_truth(truth, options)
+    models = read_models(options, sorted(set(there.object_ids.tolist())))
+    found = []
+    for path in results:
+        estimates = read_bop_results(path)
+        if not set(estimates.scene_ids.tolist()) & set(there.scene_ids.tolist()):
+            raise InputError(f"has no scene of {Path(truth).name}", path=path)
+        found.append(compare(Path(path).stem, estimates, there, models))
+    return found
+
+
+def read_truth(split: str | Path, options: EvaluatePosesOptions) -> Truth:
+    """Read the true poses of a BOP split."""
+    folders = sorted(p for p in Path(split).glob("*") if p.name.isdigit()) if Path(split).is_dir() else []
+    if not folders:
+        raise InputError("no BOP split: it has no folders like 000001", path=split)
+    wanted = None if options.keyframes is None else _keyframes(options.keyframes)
+    columns = []
+    for folder in folders:
+        scene = read_bop_scene(folder)
+        rows = scene.annotations
+        if rows is None:
+            raise InputError("has no scene_gt.json", path=folder)
+        number = int(folder.name)
+        keep = np.ones(len(rows), bool)
+        if rows.visible_fractions is not None:
+            keep &= rows.visible_fractions >= options.least_visible
+        if wanted is not None:
+            keep &= np.array([(number, image) in wanted for image in rows.image_ids.tolist()])
+        if not keep.any():
+            continue
+        place = np.searchsorted(scene.image_ids, rows.image_ids[keep])
+        ids = np.full(int(keep.sum()), number)
+        columns.append(
+            (ids, rows.image_ids[keep], rows.object_ids[keep], rows.T_cam_obj[keep], scene.camera_matrices[place])
+        )
+    if not columns:
+        raise InputError("no object is visible enough", path=split)
+    scenes, images, objects, poses, cameras = zip(*columns, strict=True)
+    return Truth(
+        np.concatenate(scenes),
+        np.concatenate(images),
+        np.concatenate(objects),
+        RigidTransform.concatenate(list(poses)),
+        np.concatenate(cameras),
+        _image_width(folders[0]),
+    )
+
+
+def read_models(options: EvaluatePosesOptions, object_ids: Sequence[int]) -> dict[int, ObjectModel]:
+    """Read points, diameters and symmetries of the objects."""
+    infos = read_models_info(options.models / "models_info.json")
+    names = {} if options.names is None else {int(k): str(v) for k, v in json.loads(options.names.read_text()).items()}
+    models = {}
+    for number in object_ids:
+        if number not in infos:
+            raise InputError(f"does not know object {number}", path=options.models / "models_info.json")
+        points = read_model_points(options.models / f"obj_{number:06d}.ply")
+        picked = np.linspace(0, len(points) - 1, min(options.points, len(points))).astype(int)
+        info = infos[number]
+        symmetric = bool(info.symmetries_continuous) or info.symmetries_discrete is not None
+        chosen = number in options.symmetric if options.symmetric else symmetric
+        models[number] = ObjectModel(names.get(number, f"{number:03d}"), points[picked], info, chosen)
+    return models
+
+
+def compare(name: str, estimates: BopResults, truth: Truth, models: Mapping[int, ObjectModel]) -> PoseEvaluation:
+    """Match estimates with the truth and measure them."""
+    images = set(zip(truth.scene_ids.tolist(), truth.image_ids.tolist()))
+    est_rows, ref_rows = match_estimates(estimates, truth)
+    classes, pooled = [], []
+    for number, model in models.items():
+        chosen = truth.object_ids[ref_rows] == number
+        est, ref = estimates.T_cam_obj[est_rows[chosen]], truth.T_cam_obj[ref_rows[chosen]]
+        there = int(np.count_nonzero(truth.object_ids == number))
+        told = [
+            (scene, image) in images
+            for scene, image, i in zip(estimates.scene_ids.tolist(), estimates.image_ids.tolist(), estimates.object_ids)
+            if i == number
+        ]
+        cameras = truth.cameras[ref_rows[chosen]]
+        classes.append(class_errors(model, est, ref, cameras, truth.image_width, there, sum(told) - len(est)))
+        pooled.append((est, ref))
+    return PoseEvaluation(name, tuple(classes), overall_errors(classes, pooled))
+
+
+def match_estimates(estimates: BopResults, truth: Truth) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """Return pairs of rows (estimate, truth)."""
+    est = _places(estimates.scene_ids, estimates.image_ids, estimates.object_ids)
+    ref = _places(truth.scene_ids, truth.image_ids, truth.object_ids)
+    pairs: list[tuple[int, int]] = []
+    for place, true_rows in ref.items():
+        rows = sorted(est.get(place, []), key=lambda row: -estimates.scores[row])[: len(true_rows)]
+        if not rows:
+            continue
+        a, b = estimates.T_cam_obj[np.array(rows)].translation, truth.T_cam_obj[np.array(true_rows)].translation
+        for i, j in zip(*linear_sum_assignment(np.linalg.norm(a[:, None] - b[None], axis=-1)), strict=True):
+            pairs.append((rows[i], true_rows[j]))
+    index = np.array(pairs, np.intp).reshape(-1, 2)
+    return index[:, 0], index[:, 1]
+
+
+def class_errors(
+    model: ObjectModel, est: RigidTransform, ref: RigidTransform, cameras: Array, width: int, true: int, false: int
+) -> ClassErrors:
+    """Measure the matched poses of one class."""
+    counts = model.name, true, len(est), true - len(est), false
+    if len(est) == 0:
+        nan = float("nan")
+        return ClassErrors(*counts, 0.0, 0.0, 0.0, 0.0, (0.0,) * 3, (0.0,) * 3, nan, nan, nan, nan, nan, 0.0, 0.0)
+    distances, nearest = add(est, ref, model.points), add_s(est, ref, model.points)
+    chosen = nearest if model.symmetric else distances
+    symmetry, info = model.info.symmetry, model.info
+    turned = est.rotation, ref.rotation
+    alike = symmetry_transforms(info.symmetries_discrete, info.symmetries_continuous, step=0.05)
+    surface = mssd(est, ref, model.points, alike) / info.diameter_m
+    pixels = np.array(
+        [mspd(est[i : i + 1], ref[i : i + 1], model.points, alike, cameras[i])[0] for i in range(len(est))]
+    )
+    thresholds = [pixel * width / 640.0 for pixel in RECALL_PIXELS]
+    return ClassErrors(
+        *counts,
+        area_under_curve_published(distances),
+        area_under_curve_published(nearest),
+        area_under_curve_published(chosen),
+        area_under_curve(chosen),
+        shares_below(chosen, YCBV_THRESHOLDS_M),
+        shares_below(chosen, [share * info.diameter_m for share in LMO_THRESHOLDS]),
+        average_translation_error(est, ref),
+        average_rotation_error(est, ref),
+        float(rotation_angle_up_to_symmetry(*turned, symmetry).mean()),
+        float("nan") if symmetry is None else float(axis_tilt(*turned, symmetry.axis).mean()),
+        float("nan") if symmetry is None else float(turn_about_axis(*turned, symmetry.axis).mean()),
+        average_recall(surface, RECALL_SHARES, true),
+        average_recall(pixels, thresholds, true),
+    )
+
+
+def shares_below(errors: Array, thresholds: Sequence[float]) -> tuple[float, ...]:
+    """Return the percentage of errors below each threshold."""
+    return tuple(100.0 * float(np.mean(errors < threshold)) for threshold in thresholds)
+
+
+def overall_errors(
+    classes: Sequence[ClassErrors], pooled: Sequence[tuple[RigidTransform, RigidTransform]]
+) -> dict[str, float]:
+    """Return means over the classes, and mean translation and rotation errors over all poses, as published."""
+    names = ("auc_add", "auc_add_s", "auc_add_or_s", "auc_add_or_s_exact", "recall_mssd", "recall_mspd")
+    overall = {name: float(np.mean([getattr(c, name) for c in classes])) for name in names}
+    for k, share in enumerate(YCBV_THRESHOLDS_M):
+        overall[f"within_{round(100 * share)}cm"] = float(np.mean([c.within_m[k] for c in classes]))
+        overall[f"within_{round(100 * share)}_percent"] = float(np.mean([c.within_diameter[k] for c in classes]))
+    some = [(est, ref) for est, ref in pooled if len(est)]
+    if some:
+        est = RigidTransform.concatenate([e for e, _ in some])
+        ref = RigidTransform.concatenate([r for _, r in some])
+        overall["translation_m"] = average_translation_error(est, ref)
+        overall["rotation_rad"] = average_rotation_error(est, ref)
+        matched = [c for c in classes if c.matched]
+        weights = [c.matched for c in matched]
+        overall["rotation_reduced_rad"] = float(np.average([c.rotation_reduced_rad for c in matched], weights=weights))
+    for name in ("true", "matched", "missed", "false"):
+        overall[name] = float(sum(getattr(c, name) for c in classes))
+    return overall
+
+
+def _places(scenes: NDArray[np.int64], images: NDArray[np.int64], objects: NDArray[np.int64]) -> Places:
+    places: Places = defaultdict(list)
+    for row, place in enumerate(zip(scenes.tolist(), images.tolist(), objects.tolist(), strict=True)):
+        places[place].append(row)
+    return places
+
+
+def _keyframes(path: Path) -> set[tuple[int, int]]:
+    pairs = set()
+    for number, line in enumerate(path.read_text().splitlines(), start=1):
+        scene, _, image = line.strip().partition("/")
+        if line.strip() and not (scene.isdigit() and image.isdigit()):
+            raise InputError(f"{line.strip()!r} is no key frame", path=path, line=number, fix="write 0048/000001")
+        if line.strip():
+            pairs.add((int(scene), int(image)))
+    return pairs
+
+
+def _image_width(folder: Path) -> int:
+    """Return the width (px) of the images of a scene; 640 where there are none."""
+    from PIL import Image
+
+    for name in ("rgb", "gray"):
+        for path in sorted((folder / name).glob("*"))[:1]:
+            with Image.open(path) as image:
+                return int(image.size[0])
+    return 640
