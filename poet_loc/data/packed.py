@@ -222,26 +222,21 @@ class PackedImages:
                 cv2.warpPerspective(image, warp, (width, height), borderMode=cv2.BORDER_REFLECT), rng, augment
             )
         R, t = R_turn @ R_old, t_old @ R_turn.T
-        boxes = self._boxes(R, t, classes, K_new, (height, width))
-        size = boxes[:, 2:] - boxes[:, :2]
-        keep = (visible >= self.least_visible) & (size.min(1) > 6.0) & self._inside(t, K_new, (height, width))
+        whole = self._boxes(R, t, classes, K_new)
+        boxes = np.clip(whole, 0.0, [width, height, width, height])
+        size, whole_size = boxes[:, 2:] - boxes[:, :2], whole[:, 2:] - whole[:, :2]
+        keep = (visible >= self.least_visible) & (size.min(1) > 6.0) & (t[:, 2] > 0.1)
+        keep &= size.prod(1) > 0.2 * whole_size.prod(1)  # turned or shifted out of the image
         flat = np.array([K_new[0, 0], K_new[1, 1], K_new[0, 2], K_new[1, 2]])
         return Sample(
             np.ascontiguousarray(image), flat, classes[keep], R[keep], t[keep], boxes[keep], visible[keep], surface
         )
 
-    def _boxes(self, R: Array, t: Array, classes: NDArray[np.int64], K: Array, size: tuple[int, int]) -> Array:
+    def _boxes(self, R: Array, t: Array, classes: NDArray[np.int64], K: Array) -> Array:
         points = self.models.points[classes - 1] @ R.mT + t[:, None]
         z = np.maximum(points[..., 2], 1e-3)
         u, v = K[0, 0] * points[..., 0] / z + K[0, 2], K[1, 1] * points[..., 1] / z + K[1, 2]
-        corners = np.stack([u.min(1), v.min(1), u.max(1), v.max(1)], -1) + 0.5  # from pixel centres to edges
-        return np.clip(corners, 0.0, [size[1], size[0], size[1], size[0]])
-
-    def _inside(self, t: Array, K: Array, size: tuple[int, int]) -> NDArray[np.bool_]:
-        """Objects whose origin lies in the image or close to it."""
-        u, v = K[0, 0] * t[:, 0] / t[:, 2] + K[0, 2], K[1, 1] * t[:, 1] / t[:, 2] + K[1, 2]
-        margin = 0.04 * size[1]
-        return (u > -margin) & (v > -margin) & (u < size[1] + margin) & (v < size[0] + margin)
+        return np.stack([u.min(1), v.min(1), u.max(1), v.max(1)], -1) + 0.5  # from pixel centres to edges
 
     def _surface(
         self, scene: PackedScene, n: int, R: Array, t: Array, classes: NDArray[np.int64], K: Array, unwarp: Array,

@@ -57,6 +57,9 @@ class NetworkOptions:
     """Levels that pass through the encoder; the others go projected to the decoder. None: all."""
     query_features: Literal["none", "roi"] = "none"
     """roi: features aligned to the box are added to the query's content."""
+    box_octaves: int | None = None
+    """Frequencies of the box code that are kept, from the lowest; None: all. The upper ones change with the last digit
+    of a box, so they are noise wherever boxes are."""
     reference_spread: Literal["point", "box"] = "point"
     """box: sampling offsets are in units of the box size instead of cells."""
     translation: Literal["direct", "ray"] = "direct"

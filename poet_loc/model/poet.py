@@ -150,7 +150,7 @@ class PoET(nn.Module):
             table = self.query_embed.weight[None].expand(len(queries.boxes), -1, -1)
             position, content = table.chunk(2, dim=-1)
             return position, content
-        code = box_code(queries.boxes, self.options.hidden_dim)
+        code = box_code(queries.boxes, self.options.hidden_dim, self.options.box_octaves)
         code = torch.where(real_queries(queries)[..., None], code, torch.full_like(code, DUMMY_CODE))
         return code, code
 

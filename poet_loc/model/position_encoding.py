@@ -61,7 +61,7 @@ class LearnedPositionEncoding(nn.Module):
         return code.permute(2, 0, 1)[None].expand(batch, -1, -1, -1)
 
 
-def box_code(boxes: Tensor, dim: int) -> Tensor:
+def box_code(boxes: Tensor, dim: int, octaves: int | None = None) -> Tensor:
     """Encode normalised boxes (..., 4) as sines and cosines of powers of two times each number -> (..., d).
 
     With d = 256 the top frequency is 2^31: the last bit of a float32 box changes the upper channels, so boxes must be
@@ -69,4 +69,5 @@ def box_code(boxes: Tensor, dim: int) -> Tensor:
     """
     frequencies = 2.0 ** torch.arange(dim // 8, dtype=boxes.dtype, device=boxes.device)
     phase = boxes[..., None] * frequencies  # (..., 4, K)
-    return torch.cat([phase.sin(), phase.cos()], dim=-1).flatten(-2)
+    kept = torch.arange(dim // 8, device=boxes.device) < (dim // 8 if octaves is None else octaves)
+    return torch.cat([phase.sin() * kept, phase.cos() * kept], dim=-1).flatten(-2)

@@ -19,6 +19,7 @@ FAITHFUL = replace(
     uncertainty="none",
     encoder_maps=None,
     query_features="none",
+    box_octaves=None,
     reference_spread="point",
     translation="direct",
     rotation_frame="camera",
@@ -38,6 +39,7 @@ PAPER_ROWS: dict[str, NetworkOptions] = {
 OUR_ROWS: dict[str, NetworkOptions] = {
     "Embedded": replace(EMBEDDED, uncertainty="none"),
     "without RoI features": replace(EMBEDDED, uncertainty="none", query_features="none"),
+    "all octaves of the box code": replace(EMBEDDED, uncertainty="none", box_octaves=None),
     "without spread reference points": replace(EMBEDDED, uncertainty="none", reference_spread="point"),
     "translation direct": replace(EMBEDDED, uncertainty="none", translation="direct"),
     "rotation in camera axes": replace(EMBEDDED, uncertainty="none", rotation_frame="camera"),

@@ -33,11 +33,12 @@ EMBEDDED = NetworkOptions(
     uncertainty="aleatoric",
     encoder_maps=(1, 2),
     query_features="roi",
+    box_octaves=5,
     reference_spread="box",
     translation="ray",
     rotation_frame="allocentric",
 )
-"""The network of the shipped checkpoint; each of its last five fields is a variant the published one does not have."""
+"""The network of the shipped checkpoint; each of its last six fields is a variant the published one does not have."""
 
 
 @dataclass(frozen=True)

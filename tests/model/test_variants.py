@@ -10,6 +10,7 @@ from torch.nn import functional as F
 
 from poet_loc.model.options import NetworkOptions
 from poet_loc.model.poet import QueryContext
+from poet_loc.model.position_encoding import box_code
 from poet_loc.model.queries import stack_queries
 from poet_loc.model.variants import (
     ROI_CELLS,
@@ -87,3 +88,13 @@ def test_roi_features_depend_on_their_own_box_and_class_alone():
     torch.testing.assert_close(single[0, 0], out[1, 1], atol=1e-5, rtol=1e-4)
     other = features(maps, stack_queries(list(boxes), list(labels.flip(1)), 5))
     assert (other[0, 0] - out[0, 0]).abs().max() > 0.1
+
+
+def test_fewer_octaves_leave_the_upper_channels_out_and_the_lower_as_they_are():
+    boxes = torch.rand(5, 4)
+    whole = box_code(boxes, 128).unflatten(-1, (4, 2, 16))
+    part = box_code(boxes, 128, octaves=5).unflatten(-1, (4, 2, 16))
+    torch.testing.assert_close(part[..., :5], whole[..., :5])
+    assert float(part[..., 5:].abs().max()) == 0.0
+    nearly = box_code(boxes * (1 + 1e-5), 128, octaves=5).unflatten(-1, (4, 2, 16))
+    assert float((nearly - part).abs().max()) < 1e-3  # a last digit no longer matters

@@ -35,6 +35,6 @@ def test_each_row_trains_and_is_measured(data, tmp_path, monkeypatch):
     small = replace(EMBEDDED, hidden_dim=32, heads=4, feedforward_dim=16, map_channels=channels)
     monkeypatch.setattr(ablation, "load_embedded", lambda: (PoET(small, SmallDetector(tiny)), ModelConfig(small, tiny)))
     figures = ablate(AblationOptions(data, tmp_path, steps=1, batch=2, val_images=2))
-    assert len(figures) == 12
-    assert len({row["t_cm"] for row in figures.values()}) == 12  # they are different networks
-    assert ablation_table(figures).count("\n") == 13
+    assert len(figures) == 13
+    assert len({row["t_cm"] for row in figures.values()}) >= 12  # other networks, but for octaves that are not there
+    assert ablation_table(figures).count("\n") == 14
