@@ -26,6 +26,8 @@ Array = NDArray[np.float64]
 Indices = NDArray[np.intp]
 
 _CONTINUES = 2.0  # squared difference of white errors on average: one of the position, one of the attitude
+_AGREED = 1.5  # support above it means that votes agree: the caster's own counts 1
+_VAGUE = 9.0  # times the other's variance
 _KEPT = 8  # hypotheses that are carried on from frame to frame
 
 
@@ -65,7 +67,9 @@ def choose_by_evidence(stamps_ns: Stamps, hypotheses: Hypotheses, memory: Memory
         beliefs = _continued(_Beliefs(own, np.zeros(len(own)), support[own]), earlier, similarity)
         order = np.lexsort((similarity.variance[beliefs.rows], -np.round(beliefs.evidence, 9)))
         beliefs = beliefs[order]
-        given = int(np.argmax(beliefs.ages <= memory.hold_s))
+        # two votes that agree need no memory to be believed
+        oldest_s = memory.hold_s if support[own].max() < _AGREED else 0.0
+        given = int(np.argmax(beliefs.ages <= oldest_s))
         chosen[frame], age_s[frame] = beliefs.rows[given], beliefs.ages[given]
         beliefs = beliefs[:_KEPT]
     return chosen, age_s
@@ -104,6 +108,12 @@ class _Similarity:
         cosine = np.abs(self.quaternions[own] @ self.quaternions[earlier].T)
         angle = 2.0 * np.arccos(np.minimum(cosine, 1.0))
         moved, turned = self.speed_square * ages**2, self.rate_square * ages**2
-        square = np.sum(apart**2, axis=-1) / (self.variance[own][:, None] + self.variance[earlier] + moved)
-        square += angle**2 / (self.rotation_variance[own][:, None] + self.rotation_variance[earlier] + turned)
+        square = np.sum(apart**2, axis=-1) / (_both(self.variance[own], self.variance[earlier]) + moved)
+        square += angle**2 / (_both(self.rotation_variance[own], self.rotation_variance[earlier]) + turned)
         return np.asarray(np.exp(-0.5 * np.maximum(square - _CONTINUES, 0.0)))
+
+
+def _both(own: Array, earlier: Array) -> Array:
+    """Return (n, m) sums of variances; a pose that is hardly known continues a well known one only if it is near."""
+    smaller = np.minimum(own[:, None], earlier)
+    return np.asarray(smaller + np.minimum(np.maximum(own[:, None], earlier), _VAGUE * smaller))

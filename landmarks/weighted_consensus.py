@@ -26,8 +26,11 @@ ACCEPTED_WEIGHT = 0.25
 """The weight at the gate: a detection that weighs less is refused."""
 
 _WIDER_START = 4.0  # the first step's gate, in gates
+_LEAST_SUPPORT = 1.0 / 3.0  # of the frame's best consensus
 _MAX_STEPS = 30
-_CONVERGED = 1e-8
+_LONGEST_STEP = 0.5  # rad and m: a pose that some direction leaves nearly free does not fly off
+_CONVERGED = 1e-7  # rad and m
+_SAME_POSE = 1e-5
 _ROWS_AT_ONCE = 16384
 
 
@@ -90,23 +93,42 @@ def _rotation_vector(rotations: Array) -> Array:
 
 
 def _starts(votes: Votes, information: Array, gate: float) -> tuple[Indices, Indices]:
-    """Return frame and place of one vote per distinct consensus: the one with the least total loss."""
+    """Return frame and place of one vote per distinct consensus: the one with the least total loss.
+
+    A consensus that explains less than a third of what the frame's best one explains is not pursued.
+    """
     frame, place = np.nonzero(votes.valid)
-    errors, _ = residuals(votes[frame], votes.R_world_cam[frame, place], votes.t_world_cam[frame, place])
-    square = np.sum(np.einsum("mki,mkij->mkj", errors, information[frame]) * errors, axis=-1)
-    consensus = np.packbits((square < _WIDER_START * gate) & votes.valid[frame], axis=1)
-    loss = np.sum(np.where(votes.valid[frame], square / (gate + square), 0.0), axis=1)
+    square = _squares(
+        votes[frame], information[frame], votes.R_world_cam[frame, place], votes.t_world_cam[frame, place]
+    )
+    consensus = np.packbits((square < gate) & votes.valid[frame], axis=1)
+    loss = np.sum(square / (gate + square), axis=1)
+    support = votes.valid[frame].sum(axis=1) - loss
+    best = np.zeros(len(votes))
+    np.maximum.at(best, frame, support)
     order = np.lexsort((place, np.round(loss, 9), *consensus.T[::-1], frame))
     key = np.column_stack([frame, consensus])[order]
-    new = np.append(True, np.any(key[1:] != key[:-1], axis=1)) if len(order) else np.empty(0, bool)
-    chosen = np.sort(order[new])
+    new = np.any(np.diff(key, axis=0, prepend=-1) != 0, axis=1)
+    chosen = np.sort(order[new & (support[order] >= _LEAST_SUPPORT * best[frame[order]])])
     return frame[chosen], place[chosen]
+
+
+def _squares(votes: Votes, information: Array, R_world_cam: Array, t_world_cam: Array) -> Array:
+    """Return (M, K) squared Mahalanobis distances, 0 where there is no vote."""
+    errors, _ = residuals(votes, R_world_cam, t_world_cam)
+    return np.asarray(np.sum(np.einsum("mki,mkij->mkj", errors, information) * errors, axis=-1))
+
+
+def _loss(votes: Votes, information: Array, R_world_cam: Array, t_world_cam: Array, gate: float) -> Array:
+    square = _squares(votes, information, R_world_cam, t_world_cam)
+    return np.asarray(np.sum(square / (gate + square), axis=1))
 
 
 def _refined(
     votes: Votes, information: Array, frame: Indices, place: Indices, gate: float, first_frame: int
 ) -> Hypotheses:
     R, t = votes.R_world_cam[frame, place].copy(), votes.t_world_cam[frame, place].copy()
+    before = _loss(votes[frame], information[frame], R, t, gate)
     active = np.arange(len(frame))
     for step in range(_MAX_STEPS):
         if not active.size:
@@ -115,10 +137,13 @@ def _refined(
         rows, inverse = votes[frame[active]], information[frame[active]]
         normal, gradient, _, _ = _normal_equations(rows, inverse, R[active], t[active], scale)
         change = -np.linalg.solve(normal, gradient[..., None])[..., 0]
+        change *= np.minimum(1.0, _LONGEST_STEP / np.maximum(np.abs(change).max(axis=1), 1e-12))[:, None]
         t[active] += np.einsum("mij,mj->mi", R[active], change[:, 3:])
         R[active] = R[active] @ Rotation.from_rotvec(change[:, :3]).as_matrix()
         moving = np.abs(change).max(axis=1) > _CONVERGED
         active = active[moving | (step == 0)]
+    worse = np.flatnonzero(_loss(votes[frame], information[frame], R, t, gate) > before)
+    R[worse], t[worse] = votes.R_world_cam[frame, place][worse], votes.t_world_cam[frame, place][worse]
     normal, _, weights, square = _normal_equations(votes[frame], information[frame], R, t, gate)
     inside = weights > ACCEPTED_WEIGHT
     freedom = 6.0 * np.maximum(inside.sum(axis=1) - 1, 1)
@@ -128,7 +153,17 @@ def _refined(
     to_world[:, :3, :3], to_world[:, 3:, 3:] = np.eye(3), R
     covariances = excess[:, None, None] * (to_world @ np.linalg.inv(normal) @ np.swapaxes(to_world, -1, -2))
     covariances = (covariances + np.swapaxes(covariances, -1, -2)) / 2.0
-    return Hypotheses(frame + first_frame, R, t, weights, covariances)
+    return Hypotheses(frame + first_frame, R, t, weights, covariances)[_first_of_each_pose(frame, R, t)]
+
+
+def _first_of_each_pose(frame: Indices, R: Array, t: Array) -> Indices:
+    """Return the rows without those that ended where an earlier start of their frame did."""
+    repeated = np.zeros(len(frame), bool)
+    for lag in range(1, int(np.bincount(frame).max(initial=0))):
+        same = frame[lag:] == frame[:-lag]
+        same &= np.abs(t[lag:] - t[:-lag]).max(axis=1) < _SAME_POSE
+        repeated[lag:] |= same & (np.abs(R[lag:] - R[:-lag]).max(axis=(1, 2)) < _SAME_POSE)
+    return np.flatnonzero(~repeated)
 
 
 def _normal_equations(
