@@ -40,7 +40,8 @@ _MM, _DEG = 1e3, 180.0 / np.pi
 _DOTS: dict[str, Any] = {"linestyle": "none", "marker": ".", "markersize": 1.5}
 _PANELS = ((0, 0, "x"), (1, 0, "y"), (2, 0, "z"), (0, 1, "yaw"), (1, 1, "roll"), (2, 1, "pitch"))
 _DECISION_COLOURS = (VERMILLION, ORANGE, PURPLE, BLUE)
-_TRUTH_STYLE: dict[str, Any] = {"color": TRUTH, "linewidth": 1.0, "label": "ground truth", "zorder": 10}
+_TRUTH_STYLE: dict[str, Any] = {"color": TRUTH, "linewidth": 1.8, "label": "ground truth", "zorder": 5}
+_FUSED_STYLE: dict[str, Any] = {"linewidth": 0.8, "zorder": 8}
 _TIME = "time [s]"
 _LONGEST_PATH = 20_000  # points of a drawn trajectory
 
@@ -285,7 +286,7 @@ def _thinned(trajectory: Trajectory) -> Trajectory:
 
 
 def _marks(estimate: Estimate) -> dict[str, Any]:
-    return {"label": label(estimate)} | (_DOTS if estimate.name.startswith("localize/") else {"linewidth": 0.9})
+    return {"label": label(estimate)} | (_DOTS if estimate.name.startswith("localize/") else _FUSED_STYLE)
 
 
 def _range(values: Any) -> tuple[float, float]:
