@@ -1,0 +1,40 @@
+"""poet-loc evaluate-poses: object poses against the truth."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+from poet_loc.cli.arguments import Flat
+from poet_loc.cli.terminal import print_tables
+from poet_loc.report.pose_evaluation import EvaluatePosesOptions, evaluate_poses
+from poet_loc.report.pose_tables import pose_tables
+
+
+@dataclass(frozen=True)
+class Arguments:
+    """Errors of object poses per class: ADD, ADD-S and their areas, translation, rotation, BOP's recalls."""
+
+    results: Annotated[tuple[Path, ...], tyro.conf.Positional, tyro.conf.arg(metavar="RESULTS.csv")]
+    """BOP results, one file or several beside each other (e.g. with true and with predicted boxes)."""
+    truth: Path
+    """BOP split folder."""
+    options: Flat[EvaluatePosesOptions]
+    out: Path | None = None
+    """Folder for poses.json, poses.md and poses.tex."""
+
+
+def execute(arguments: Arguments) -> None:
+    """Print the tables, and write them where asked."""
+    found = evaluate_poses(arguments.results, arguments.truth, arguments.options)
+    tables = pose_tables(found)
+    print_tables(tables)
+    if arguments.out is not None:
+        arguments.out.mkdir(parents=True, exist_ok=True)
+        (arguments.out / "poses.json").write_text(json.dumps([e.to_json() for e in found], indent=1) + "\n")
+        (arguments.out / "poses.md").write_text("\n".join(table.markdown() for table in tables))
+        (arguments.out / "poses.tex").write_text("\n".join(table.latex() for table in tables))
