@@ -8,6 +8,8 @@ T. D. Barfoot, "State Estimation for Robotics" (2017) (B).
 
 from __future__ import annotations
 
+import warnings
+
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import RigidTransform, Rotation
@@ -107,4 +109,6 @@ def chordal_mean(rotations: ArrayLike, weights: ArrayLike) -> Array:
 
 def yaw_pitch_roll(rotation: Rotation) -> Array:
     """Return intrinsic z-y-x angles (yaw, pitch, roll) in rad, (3,) or (N, 3); pitch in [-pi/2, pi/2]."""
-    return np.asarray(rotation.as_euler("ZYX", suppress_warnings=True))  # at the lock roll is 0
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", "Gimbal lock")  # the angles are right there, too, with roll 0
+        return np.asarray(rotation.as_euler("ZYX"))

@@ -98,7 +98,7 @@ def test_batches_equal_single_calls(function, batch: tuple[int, ...]) -> None:  
         np.testing.assert_array_equal(result[index], function(vectors[index]))
 
 
-@pytest.mark.parametrize("batch", BATCHES)
+@pytest.mark.parametrize("batch", [(), (1,), (5,)])
 def test_adjoint_moves_a_tangent_to_the_other_side(batch: tuple[int, ...]) -> None:
     rng = np.random.default_rng(4)
     T, xi = random_pose(rng, batch), rng.normal(size=(*batch, 6))
