@@ -73,6 +73,8 @@ def _correction(votes: Array, i: int, origin: Array, gravity: Array, since: floa
 def _tilt(C: Array, up: Array) -> float:
     """Return the angle (rad) between the corrected up direction and world z."""
     norm = math.sqrt(up[0] ** 2 + up[1] ** 2 + up[2] ** 2)
+    if norm == 0.0:  # nothing feels gravity
+        return 0.0
     z = (C[6] * up[0] + C[7] * up[1] + C[8] * up[2]) / norm
     return math.acos(min(1.0, max(-1.0, z)))
 

@@ -77,6 +77,7 @@ from fusion.nav_state import (
     Array,
     Ints,
 )
+from fusion.odometry import IS_ODOMETRY, move_by_odometry, spread_by_odometry
 from fusion.so3_kernels import (
     apply,
     multiply,
@@ -127,7 +128,9 @@ def advance(m: Memory, w: Work, imu_stamps: Ints, imu_values: Array, until: int)
             rate[i] = imu_values[k, i] + share * (imu_values[k + 1, i] - imu_values[k, i])
             force[i] = imu_values[k, 3 + i] + share * (imu_values[k + 1, 3 + i] - imu_values[k, 3 + i])
         dt = (stop - c[NOW]) * 1e-9
-        if c[MODE] == TRACKING:
+        if m.noise[IS_ODOMETRY] > 0.0:
+            _advance_by_odometry(m, w, dt, imu_values[k])
+        elif c[MODE] == TRACKING:
             if m.layout[AT_GRAVITY] >= 0:
                 write_gravity_basis(m.x, w.basis)
             propagate_nominal(m.x, dt, rate, force, w.step)
@@ -139,6 +142,16 @@ def advance(m: Memory, w: Work, imu_stamps: Ints, imu_values: Array, until: int)
         c[NOW] = stop
         if stop == end:
             c[IMU_AT] = k + 1
+
+
+@njit(cache=True)
+def _advance_by_odometry(m: Memory, w: Work, dt: float, twist: Array) -> None:
+    R_before = w.scratch[6:15]
+    for i in range(9):
+        R_before[i] = m.x[i]
+    move_by_odometry(m.x, dt, twist[0:3], twist[3:6], w.step)
+    if m.counters[MODE] == TRACKING:
+        spread_by_odometry(m.P, R_before, dt, m.noise, m.layout, w.step)
 
 
 @njit(cache=True)
@@ -410,7 +423,7 @@ def _restart_if_lost(m: Memory, w: Work) -> None:
         return
     m.up[0], m.up[1], m.up[2] = 0.0, 0.0, 1.0
     count, _ = _agreement(m, w, first)
-    if count > m.start[LOST_MIN_VOTES] and count > 3.0 * used:
+    if count >= m.start[LOST_MIN_VOTES] and count > 3.0 * used:
         _adopt(m, w, GYRO_BIAS_ERROR)
         m.counters[RESTARTS] += 1
         m.counters[STARTED_AT] = m.counters[NOW]

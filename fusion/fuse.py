@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -80,13 +81,14 @@ def run_filter(
             fix="check the map and the extrinsics, or relax --start",
         )
     counters = memory.views.py_func(floats, integers).counters
-    return result_from_rows(
+    result = result_from_rows(
         f"fuse/{estimator}/{options.measurements}",
         (stamps[:written], core[:written], sigma[:written], covariance[:written].reshape(-1, 6, 6)),
         gate_log(problem, decisions, nis),
         time.perf_counter() - began,
         int(counters[memory.RESTARTS]),
     )
+    return replace(result, motion=problem.motion, body=problem.body)
 
 
 def result_from_rows(

@@ -61,7 +61,7 @@ class Memory(NamedTuple):
     refused: Array  # (K, 2) how often in a row each object's rotation and position were refused
     known: Array  # (K,) 1 where an object's pose in the world is known, 0 before it was first seen
     up: Array  # (3,) running mean of the specific force in the axes of the integrated motion
-    noise: Array
+    noise: Array  # of the motion: places in imu.py and odometry.py
     limits: Array  # places: filter_loop.LIMIT_BOTH and following
     start: Array
     bias_model: Array
@@ -90,7 +90,7 @@ def allocate(layout: StateLayout) -> tuple[Array, Ints]:
         (AT_KNOWN, max(K, 1)),
         (AT_UP, 3),
         (END_OF_STATE, 0),
-        (AT_NOISE, 8),
+        (AT_NOISE, 12),
         (AT_LIMITS, 8),
         (AT_START, 16),
         (AT_BIAS_MODEL, 14),
@@ -161,7 +161,7 @@ def views(floats: Array, integers: Ints) -> Memory:
         f[i[AT_REFUSED] : i[AT_REFUSED] + 2 * K].reshape((K, 2)),
         f[i[AT_KNOWN] : i[AT_KNOWN] + K],
         f[i[AT_UP] : i[AT_UP] + 3],
-        f[i[AT_NOISE] : i[AT_NOISE] + 8],
+        f[i[AT_NOISE] : i[AT_NOISE] + 12],
         f[i[AT_LIMITS] : i[AT_LIMITS] + 8],
         f[i[AT_START] : i[AT_START] + 16],
         f[i[AT_BIAS_MODEL] : i[AT_BIAS_MODEL] + 14],

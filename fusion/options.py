@@ -152,6 +152,28 @@ class Estimate:
 
 
 @dataclass(frozen=True)
+class Odometry:
+    """How odometry drifts, where it is the source of motion: measured on visual odometry (ORB-SLAM3) of YCB-V."""
+
+    rotation_walk_deg: float = 0.25
+    """deg per square root of a second, per axis."""
+    translation_walk: float = 0.005
+    """m per square root of a second, per axis."""
+
+
+@dataclass(frozen=True)
+class ConstantVelocity:
+    """How a camera moves of which nothing is known, where neither IMU nor odometry is there."""
+
+    acceleration: float = 1.0
+    """m/s^2 per square root of Hz."""
+    angular_acceleration: float = 2.0
+    """rad/s^2 per square root of Hz."""
+    rate_hz: float = 60.0
+    """Steps per second, Hz."""
+
+
+@dataclass(frozen=True)
 class Gap:
     """How an interruption of the IMU is bridged."""
 
@@ -193,6 +215,8 @@ class FuseOptions:
     """eskf: error-state Kalman filter; graph: fixed-lag smoother; batch: the whole log at once."""
     measurements: Literal["camera", "objects"] = "objects"
     """camera: the solver's (or the log's own) camera poses; objects: each object's pose directly."""
+    motion: Literal["auto", "imu", "odometry", "constant-velocity"] = "auto"
+    """What carries the state between measurements; auto: the IMU, else the odometry, else constant velocity."""
     noise: DetectionNoise = field(default_factory=DetectionNoise)
     camera_noise: CameraNoise = field(default_factory=CameraNoise)
     bias: DetectionBias = field(default_factory=DetectionBias)
@@ -201,4 +225,6 @@ class FuseOptions:
     prior: Prior = field(default_factory=Prior)
     estimate: Estimate = field(default_factory=Estimate)
     gap: Gap = field(default_factory=Gap)
+    odometry: Odometry = field(default_factory=Odometry)
+    constant_velocity: ConstantVelocity = field(default_factory=ConstantVelocity)
     graph: Graph = field(default_factory=Graph)

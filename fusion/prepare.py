@@ -5,14 +5,16 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import chi2
 
-from fusion import consensus, eskf, filter_loop, imu, memory
+from fusion import consensus, eskf, filter_loop, imu, memory, odometry
 from fusion.measurements import CAMERA_POSE, OBJECT_POSE, Measurements, ray_aligned_covariance
-from fusion.nav_state import StateLayout, nominal_state
+from fusion.motion_source import Kind, motion_source
+from fusion.nav_state import ACCEL_BIAS_ERROR, CORE, GYRO_BIAS_ERROR, VELOCITY_ERROR, StateLayout, nominal_state
 from fusion.options import DetectionBias, FuseOptions
 from poet_loc.core.input_error import InputError
 from poet_loc.core.records import Calibration, CameraPoses, ImuNoise, ImuSamples, LandmarkMap, ObjectPoses
@@ -21,6 +23,8 @@ from poet_loc.io.log_folder import Log
 Array = NDArray[np.float64]
 
 NEAREST_OBJECT = 1e-3  # m
+STANDARD_GRAVITY = 9.81  # m/s^2
+VELOCITY_OF_ODOMETRY = 0.05  # m/s, reported beside the velocity that odometry gives
 
 
 @dataclass(frozen=True)
@@ -29,11 +33,14 @@ class Problem:
 
     path: Path
     imu: ImuSamples
+    """Samples of the motion: the IMU's, or what stands in their place (`motion_source.MotionSource`)."""
     imu_noise: ImuNoise
     calibration: Calibration
     measurements: Measurements
     layout: StateLayout
     landmark_map: LandmarkMap | None
+    motion: Kind = "imu"
+    body: Literal["imu", "cam"] = "imu"
 
     @property
     def keys(self) -> list[tuple[int, int]]:
@@ -46,15 +53,9 @@ def pose_problem(
 ) -> Problem:
     """Return what the options ask to be fused of a log.
 
-    Raises InputError where IMU, calibration, map or poses are missing.
+    Raises InputError where motion, calibration, map or poses are missing.
     """
-    if log.imu is None:
-        raise InputError("the log has no imu.csv, which fusion needs", path=log.path, fix="run localize alone")
-    calibration = log.calibration
-    if calibration is None or calibration.imu is None or calibration.T_cam_imu is None:
-        raise InputError(
-            "fusion needs T_cam_imu and the IMU's noise densities", path=log.path / "calibration.yaml", fix="add them"
-        )
+    calibration = log.calibration or Calibration()
     layout = layout_for(log.landmark_map, options)
     if options.measurements == "camera":
         poses = camera_poses if camera_poses is not None else log.camera_poses
@@ -66,7 +67,11 @@ def pose_problem(
             raise InputError("there is no landmarks.json", path=log.path, fix="fuse camera poses instead")
         detections = object_poses if object_poses is not None else log.detections(None)[1]
         measured = object_measurements(detections, log.landmark_map, calibration, options)
-    return Problem(log.path, log.imu, calibration.imu, calibration, measured, layout, log.landmark_map)
+    source = motion_source(log, calibration, options, measured.stamps_ns)
+    if source.kind != "imu" and options.estimate.gravity:
+        raise InputError(f"{source.kind} feels no gravity", fix="do not estimate its direction")
+    motion = (source.samples, source.noise, calibration, measured, layout, log.landmark_map, source.kind, source.body)
+    return Problem(log.path, *motion)
 
 
 def landmark_of_detection(poses: ObjectPoses, landmark_map: LandmarkMap) -> NDArray[np.int64]:
@@ -163,7 +168,8 @@ def fill_memory(problem: Problem, options: FuseOptions) -> tuple[Array, NDArray[
     m = memory.views.py_func(floats, integers)
     T_imu_cam = None if calibration.T_cam_imu is None else calibration.T_cam_imu.inv()
     T_world_obj = landmark_map.T_world_obj if layout.n_objects and landmark_map is not None else None
-    m.x[:] = nominal_state(layout, T_imu_cam=T_imu_cam, T_world_obj=T_world_obj)
+    gravity = STANDARD_GRAVITY if problem.motion == "imu" else 0.0
+    m.x[:] = nominal_state(layout, T_imu_cam=T_imu_cam, T_world_obj=T_world_obj, gravity=gravity)
     m.noise[[imu.GYRO_NOISE, imu.ACCEL_NOISE, imu.GYRO_WALK, imu.ACCEL_WALK]] = (
         imu_noise.gyroscope_noise_density,
         imu_noise.accelerometer_noise_density,
@@ -189,6 +195,9 @@ def fill_memory(problem: Problem, options: FuseOptions) -> tuple[Array, NDArray[
     steady[eskf.BIAS_ROTATION] = math.radians(bias.steady_rotation_deg)
     steady[[eskf.BIAS_ACROSS, eskf.BIAS_ALONG, eskf.BIAS_TAU]] = bias.steady_across, bias.steady_along, math.inf
     m.prior[:] = _prior(layout, options)
+    _without_imu(problem, options, m)
+    if landmark_map is not None and layout.objects and options.estimate.map == "approximate":
+        _map_prior(landmark_map, layout, m.prior)
     m.known[:] = 1.0
     if options.estimate.map == "unknown":
         m.known[1:] = 0.0
@@ -199,6 +208,32 @@ def fill_memory(problem: Problem, options: FuseOptions) -> tuple[Array, NDArray[
                 m.orders[k] = 0 if landmark.symmetry.order == "continuous" else landmark.symmetry.order
     m.scales[:] = 1.0
     return floats, integers
+
+
+def _without_imu(problem: Problem, options: FuseOptions, m: memory.Memory) -> None:
+    """Change what an IMU has and another source of motion has not."""
+    if problem.motion == "imu":
+        return
+    m.start[consensus.MAX_TILT] = math.pi
+    m.noise[imu.GAP_S] = math.inf
+    m.prior[GYRO_BIAS_ERROR:CORE] = 1e-9
+    if problem.motion == "constant-velocity":
+        m.prior[GYRO_BIAS_ERROR:ACCEL_BIAS_ERROR] = math.radians(60.0)  # minus the angular velocity
+        return
+    m.noise[odometry.IS_ODOMETRY] = 1.0
+    m.noise[odometry.ROTATION_WALK] = math.radians(options.odometry.rotation_walk_deg)
+    m.noise[odometry.TRANSLATION_WALK] = options.odometry.translation_walk
+    m.prior[VELOCITY_ERROR:GYRO_BIAS_ERROR] = VELOCITY_OF_ODOMETRY
+
+
+def _map_prior(landmark_map: LandmarkMap, layout: StateLayout, sigma: Array) -> None:
+    """Put the landmarks' own covariances into the prior: rotation in object axes, position in world axes."""
+    for k, landmark in enumerate(landmark_map):
+        if landmark.covariance is not None:
+            R_world_obj = landmark.T_world_obj.rotation.as_matrix()
+            position = R_world_obj @ landmark.covariance[3:, 3:] @ R_world_obj.T
+            variances = np.r_[np.diag(landmark.covariance)[:3], np.diag(position)]
+            sigma[layout.error_slice("objects", k)] = np.sqrt(variances)
 
 
 def _limits(options: FuseOptions) -> list[float]:

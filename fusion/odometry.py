@@ -1,0 +1,74 @@
+"""Propagation by odometry instead of an IMU: relative poses with drift, no gravity, no biases.
+
+Between two poses of the odometry the body moves at a constant twist, so the motion over any part of the interval is
+the exponential of that part: R <- R Exp(w dt), p <- p + R J_l(w dt) v dt. Its errors are random walks.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+from scipy.spatial.transform import RigidTransform
+
+from fusion.nav_state import N_ERROR, POSITION, POSITION_ERROR, VELOCITY, Array, Ints
+from fusion.so3_kernels import apply, exp_so3, left_jacobian, multiply, orthonormalise, times_skew
+from poet_loc.core.geometry import local
+from poet_loc.core.records import ImuSamples
+from poet_loc.core.trajectory import Trajectory
+
+# Places in the noise array, behind those of the IMU.
+IS_ODOMETRY, ROTATION_WALK, TRANSLATION_WALK = 7, 8, 9
+
+
+def odometry_samples(T_odom_cam: Trajectory, T_cam_body: RigidTransform) -> ImuSamples:
+    """Return the body's twist from each pose of the odometry to the next, in the place of IMU samples.
+
+    Angular velocity (rad/s) stands for itself, the body's velocity (m/s, body axes) in the place of the specific force;
+    both hold until the next stamp.
+    """
+    T_odom_body = T_odom_cam.T_world_body * T_cam_body
+    seconds = np.diff(T_odom_cam.stamps_ns)[:, None] * 1e-9
+    twist = local(T_odom_body[:-1], T_odom_body[1:]) / seconds
+    twist = np.vstack([twist, twist[-1:]])
+    return ImuSamples(T_odom_cam.stamps_ns, np.ascontiguousarray(twist[:, :3]), np.ascontiguousarray(twist[:, 3:]))
+
+
+@njit(cache=True)
+def move_by_odometry(x: Array, dt: float, rate: Array, velocity: Array, work: Array) -> None:
+    """Move the nominal state by dt seconds of a twist, in place; leave Exp(w dt) at 0 and R dp at 18 of work."""
+    turn, jacobian, step, moved = work[0:9], work[9:18], work[18:21], work[27:36]
+    wx, wy, wz = rate[0] * dt, rate[1] * dt, rate[2] * dt
+    exp_so3(wx, wy, wz, turn)
+    left_jacobian(wx, wy, wz, 1.0, jacobian)
+    apply(jacobian, velocity[0] * dt, velocity[1] * dt, velocity[2] * dt, work[21:24])
+    apply(x, work[21], work[22], work[23], step)
+    multiply(x, turn, moved)
+    for i in range(9):
+        x[i] = moved[i]
+    orthonormalise(x, moved)
+    apply(x, velocity[0], velocity[1], velocity[2], moved)
+    for i in range(3):
+        x[POSITION + i] += step[i]
+        x[VELOCITY + i] = moved[i]
+
+
+@njit(cache=True)
+def spread_by_odometry(P: Array, R_before: Array, dt: float, noise: Array, layout: Ints, work: Array) -> None:
+    """P <- F P F^T + Q after `move_by_odometry`, in place: attitude turns with the body, position by the lever."""
+    n, lever, turn = layout[N_ERROR], work[36:45], work[0:9]
+    times_skew(R_before, work[21], work[22], work[23], lever)
+    for side in range(2):
+        for j in range(n):
+            a0, a1, a2 = (P[0, j], P[1, j], P[2, j]) if side == 0 else (P[j, 0], P[j, 1], P[j, 2])
+            for i in range(3):
+                turned = turn[i] * a0 + turn[3 + i] * a1 + turn[6 + i] * a2
+                shift = lever[3 * i] * a0 + lever[3 * i + 1] * a1 + lever[3 * i + 2] * a2
+                if side == 0:
+                    P[POSITION_ERROR + i, j] -= shift
+                    P[i, j] = turned
+                else:
+                    P[j, POSITION_ERROR + i] -= shift
+                    P[j, i] = turned
+    for i in range(3):
+        P[i, i] += noise[ROTATION_WALK] ** 2 * dt
+        P[POSITION_ERROR + i, POSITION_ERROR + i] += noise[TRANSLATION_WALK] ** 2 * dt
