@@ -19,8 +19,8 @@ from poet_loc.report.pose_tables import pose_tables
 class Arguments:
     """Errors of object poses per class: ADD, ADD-S and their areas, translation, rotation, BOP's recalls."""
 
-    results: Annotated[tuple[Path, ...], tyro.conf.Positional, tyro.conf.arg(metavar="RESULTS.csv")]
-    """BOP results, one file or several beside each other (e.g. with true and with predicted boxes)."""
+    results: Annotated[tuple[Path, ...], tyro.conf.Positional, tyro.conf.arg(metavar="RESULTS")]
+    """BOP results (.csv) or PoET's (.json), one or several beside each other (say, true and predicted boxes)."""
     truth: Path
     """BOP split folder."""
     options: Flat[EvaluatePosesOptions]

@@ -65,6 +65,8 @@ class Estimator:
 
     def __init__(self, options: DetectOptions, intrinsics: tuple[float, float, float, float] | None = None) -> None:
         self.options = options
+        if options.threads is not None:
+            torch.set_num_threads(options.threads)
         self.network, self.config = _load(options)
         self.device = torch.device(options.device)
         self.network.to(self.device).requires_grad_(False)

@@ -21,6 +21,8 @@ class DetectOptions:
     """fast: fused path for CPUs; bfloat16: the same at half width, less exact; eager: plain torch, also on a GPU."""
     device: str = "cpu"
     """cpu or cuda; a GPU takes engine eager."""
+    threads: int | None = None
+    """CPU threads; on a machine that others load, 1 is often fastest.  Without it torch's default."""
     batch: int = 1
     """Images at a time."""
     score: float = 0.0

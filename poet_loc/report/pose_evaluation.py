@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
@@ -36,7 +35,9 @@ from poet_loc.core.symmetric_errors import (
 from poet_loc.io.bop import read_bop_scene
 from poet_loc.io.bop_models import BopModel, read_models_info
 from poet_loc.io.bop_results_csv import BopResults, read_bop_results
+from poet_loc.io.input_text import read_json
 from poet_loc.io.ply import read_model_points
+from poet_loc.io.poet_results import read_poet_results
 
 Array = NDArray[np.float64]
 Places = dict[tuple[int, int, int], list[int]]
@@ -62,6 +63,8 @@ class EvaluatePosesOptions:
     """Classes file, object id to name."""
     points: int = 1000
     """Model points per object, evenly picked."""
+    scene: int | None = None
+    """Scene of a results.json, which does not tell it."""
 
 
 @dataclass(frozen=True)
@@ -141,7 +144,7 @@ class Truth:
 
 
 def evaluate_poses(results: Sequence[Path], truth: str | Path, options: EvaluatePosesOptions) -> list[PoseEvaluation]:
-    """Compare results files (BOP csv) with a BOP split folder.
+    """Compare results files (BOP csv, or PoET's results.json) with a BOP split folder.
 
     In every image the estimates of an object are assigned to its instances by distance, the best scores first where
     there are more estimates than instances.  Raises InputError for files that do not fit each other.
@@ -150,11 +153,41 @@ def evaluate_poses(results: Sequence[Path], truth: str | Path, options: Evaluate
     models = read_models(options, sorted(set(there.object_ids.tolist())))
     found = []
     for path in results:
-        estimates = read_bop_results(path)
+        estimates = read_results(path, options)
         if not set(estimates.scene_ids.tolist()) & set(there.scene_ids.tolist()):
             raise InputError(f"has no scene of {Path(truth).name}", path=path)
         found.append(compare(Path(path).stem, estimates, there, models))
     return found
+
+
+def read_results(path: Path, options: EvaluatePosesOptions) -> BopResults:
+    """Read BOP results, or PoET's results.json: the image is the number in its id, the object that of the class."""
+    if path.suffix != ".json":
+        return read_bop_results(path)
+    if options.scene is None:
+        raise InputError("does not tell its scene", path=path, fix="give --scene")
+    found = read_poet_results(path)
+    numbers = np.array([int("".join(c for c in image if c.isdigit()) or -1) for image in found.image_ids])
+    objects = found.classes if options.names is None else np.array(list(_names(options)))[found.classes - 1]
+    count = len(found)
+    return BopResults(
+        np.full(count, options.scene, np.int64),
+        numbers[found.image_indices],
+        objects.astype(np.int64),
+        np.ones(count),
+        found.T_cam_obj,
+        np.full(count, -1.0),
+    )
+
+
+def _names(options: EvaluatePosesOptions) -> dict[int, str]:
+    if options.names is None:
+        return {}
+    content = read_json(options.names)
+    try:
+        return {int(number): str(name) for number, name in content.items()}
+    except (AttributeError, ValueError):
+        raise InputError('is no classes file like {"1": "name"}', path=options.names) from None
 
 
 def read_truth(split: str | Path, options: EvaluatePosesOptions) -> Truth:
@@ -198,7 +231,7 @@ def read_truth(split: str | Path, options: EvaluatePosesOptions) -> Truth:
 def read_models(options: EvaluatePosesOptions, object_ids: Sequence[int]) -> dict[int, ObjectModel]:
     """Read points, diameters and symmetries of the objects."""
     infos = read_models_info(options.models / "models_info.json")
-    names = {} if options.names is None else {int(k): str(v) for k, v in json.loads(options.names.read_text()).items()}
+    names = _names(options)
     models = {}
     for number in object_ids:
         if number not in infos:

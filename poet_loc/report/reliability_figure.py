@@ -17,7 +17,7 @@ def reliability_figure(
 
     On the diagonal the covariances are honest, below it they are too small.
     """
-    figure = Figure(figsize=(WIDTH / 3 * len(before), WIDTH / 3), layout="constrained")
+    figure = Figure(figsize=(WIDTH / 3 * len(before), WIDTH / 3 + 0.5), layout="constrained")
     axes = figure.subplots(1, len(before), sharey=True, squeeze=False)[0]
     for axis, name in zip(axes, before, strict=True):
         axis.plot([0, 1], [0, 1], color=FAINT, label="honest")
@@ -25,5 +25,5 @@ def reliability_figure(
         axis.plot(levels, after[name], color=BLUE, marker="s", markersize=2.5, label="after")
         axis.set(xlabel="probability of the ellipsoid", title=name, xlim=(0, 1), ylim=(0, 1), aspect="equal")
     axes[0].set_ylabel("share of errors inside")
-    axes[0].legend(loc="upper left")
+    figure.legend(*axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=3)
     return figure

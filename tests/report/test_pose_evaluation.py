@@ -15,6 +15,7 @@ from poet_loc.core.input_error import InputError
 from poet_loc.io.bop_models import BopModel
 from poet_loc.io.bop_results_csv import BopResults, write_bop_results
 from poet_loc.io.ply import read_model_points
+from poet_loc.io.poet_results import PoetResults, write_poet_results
 from poet_loc.report.pose_evaluation import (
     EvaluatePosesOptions,
     ObjectModel,
@@ -150,6 +151,26 @@ def test_perfect_results(split: Path) -> None:
     assert found.overall["auc_add_or_s"] == pytest.approx(99.858, abs=1e-3)
     assert found.overall["auc_add_or_s_exact"] == pytest.approx(100.0)
     assert found.overall["recall_mssd"] == found.overall["recall_mspd"] == 100.0
+
+
+def test_results_json_is_evaluated_too(split: Path) -> None:
+    results = perfect(split)
+    (split / "classes.json").write_text('{"1": "first", "2": "second"}')
+    images = np.unique(results.image_ids)
+    found = PoetResults(
+        tuple(f"{image:06d}" for image in images),
+        np.searchsorted(images, results.image_ids),
+        results.object_ids,
+        results.T_cam_obj,
+        np.full((len(results), 4), 0.5),
+    )
+    write_poet_results(split / "results.json", found)
+    options = EvaluatePosesOptions(split / "models", names=split / "classes.json", scene=3)
+    evaluation = evaluate_poses([split / "results.json"], split / "test", options)[0]
+    assert [c.name for c in evaluation.classes] == ["first", "second"]
+    assert evaluation.overall["auc_add_or_s_exact"] == pytest.approx(100.0)
+    with pytest.raises(InputError, match="does not tell its scene"):
+        evaluate_poses([split / "results.json"], split / "test", replace(options, scene=None))
 
 
 def test_a_half_turn_of_the_symmetric_object_is_no_error(split: Path) -> None:
