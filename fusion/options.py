@@ -28,6 +28,9 @@ class CameraNoise:
     """1-sigma of position per axis, m."""
     rotation_deg: float = 2.0
     """1-sigma of rotation per axis, deg."""
+    solver_scale: float = 8.0
+    """The 1-sigma of the solver's own poses is taken so many times larger: their errors last for seconds, and a filter
+    that takes them for white believes itself by about the square root of twice that time in frames too much."""
 
 
 @dataclass(frozen=True)
@@ -112,11 +115,11 @@ class Start:
 class Prior:
     """1-sigma of what is not known at the start."""
 
-    attitude_deg: float = 10.0
+    attitude_deg: float = 5.0
     """Attitude, deg."""
-    position: float = 0.2
+    position: float = 0.08
     """Position, m."""
-    velocity: float = 0.5
+    velocity: float = 0.3
     """Velocity, m/s."""
     gyroscope_bias: float = 0.02
     """Gyroscope bias, rad/s."""
@@ -128,7 +131,7 @@ class Prior:
     """Camera-IMU translation where it is estimated, m."""
     time_offset: float = 0.03
     """Camera-IMU time offset where it is estimated, s."""
-    gravity_deg: float = 2.0
+    gravity_deg: float = 0.5
     """Direction of gravity where it is estimated, deg."""
     map_position: float = 0.05
     """Landmark position of an approximate map without covariances, m."""
@@ -200,7 +203,9 @@ class Graph:
     kernel_width: float = 3.5
     """Where it begins to bend, in 1-sigma of all six rows."""
     relinearize: float = 0.01
-    """The fixed-lag smoother linearises anew what has moved by more, rad and m."""
+    """The fixed-lag smoother linearises anew what has moved by more, rad and m,"""
+    relinearize_every: int = 5
+    """looking once in so many keyframes."""
     max_iterations: int = 20
     """Steps of the batch optimiser."""
     rounds: int = 3
