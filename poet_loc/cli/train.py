@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, fields, replace
+from pathlib import Path
 from typing import Any, Literal
 
 from poet_loc.cli.arguments import Flat
+from poet_loc.core.input_error import InputError
 from poet_loc.train.options import RECIPES, TrainOptions
 
 
@@ -14,9 +16,11 @@ class Arguments:
     """Train a pose network on BOP data or an annotation file; torchrun runs it on several processes."""
 
     options: Flat[TrainOptions]
-    preset: Literal["paper", "code", "ycbv"] | None = None
+    preset: Literal["paper", "code", "ycbv", "embedded"] | None = None
     """Published recipe: of the paper, of the official code, or what its authors gave for YCB-V.  It replaces the
-    optimiser's and the loss's options that were left at their defaults."""
+    optimiser's and the loss's options that were left at their defaults.  embedded: the network that comes with the
+    package, from rendering to calibration; of the options it reads out, data.train (the split train of the rendered
+    data set, made where it is missing), recipe.batch, seed and max_steps, and it always resumes."""
 
 
 def execute(arguments: Arguments) -> None:
@@ -24,12 +28,28 @@ def execute(arguments: Arguments) -> None:
     from poet_loc.train.pose_training import train
 
     options = arguments.options
+    if arguments.preset == "embedded":
+        print(_train_embedded(options))
+        return
     if arguments.preset is not None:
         recipe, loss = RECIPES[arguments.preset]
         options = replace(options, recipe=_over(options.recipe, recipe), loss=_over(options.loss, loss))
     out = train(options)
     names = [name for name in ("best.safetensors", "network.safetensors", "last.pt") if (out / name).exists()]
     print(f"{out}: {', '.join(names)}")
+
+
+def _train_embedded(options: TrainOptions) -> Path:
+    from poet_loc.train.embedded_preset import EmbeddedPresetOptions, train_preset
+
+    if options.data.train.name != "train":
+        fix = "give --data.train FOLDER/train: FOLDER gets models/, train/ and val/"
+        raise InputError("the preset embedded renders the split train", path=options.data.train, fix=fix)
+    world, batch = options.data.train.parent, options.recipe.batch
+    chosen = EmbeddedPresetOptions(
+        options.out, batch=batch, seed=options.seed, max_steps=options.max_steps, world=world
+    )
+    return train_preset(chosen)
 
 
 def _over(given: Any, preset: Any) -> Any:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import math
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -40,8 +39,10 @@ class EmbeddedPresetOptions:
     """Seed of data and weights."""
     precision: str = "auto"
     """auto: bfloat16 where the CPU has matrix units for it, else float32."""
-    minutes: float = math.inf
-    """CPU minutes of each stage in this stretch."""
+    max_steps: int | None = None
+    """Stop, resumable, after so many steps of each stage in this stretch."""
+    world: Path | None = None
+    """Folder of the rendered data set; without it out/world."""
     jobs: int = -1
     """Processes that render; -1: one per core."""
 
@@ -50,7 +51,7 @@ def train_preset(options: EmbeddedPresetOptions) -> Path:
     """Do whatever is missing and return the checkpoint."""
     from poet_loc.data.render import RenderOptions, render
 
-    world, cache = options.out / "world", options.out / "packed"
+    world, cache = options.world or options.out / "world", options.out / "packed"
     shared = {"out": world, "seed": options.seed, "jobs": options.jobs}
     render(RenderOptions(split="val", images=options.val_images, first_scene=900_000, **shared))  # type: ignore[arg-type]
     render(RenderOptions(split="train", images=options.train_images, **shared))  # type: ignore[arg-type]
@@ -71,7 +72,7 @@ def _steps(options: EmbeddedPresetOptions, stage: str, count: int, rate: float) 
         learning_rate=rate,
         precision=options.precision,
         seed=options.seed,
-        minutes=options.minutes,
+        max_steps=options.max_steps,
     )
 
 

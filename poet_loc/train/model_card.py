@@ -184,7 +184,8 @@ def card_table(figures: Figures) -> str:
         lines.append(_row("**without silhouette symmetry**", kind, scores, plain))
     lines += ["", "| boxes | within one sigma, x y z | about x y z |", "|---|---|---|"]
     for kind, scores in figures.scores.items():
-        inside = 100 * np.nanmean(np.where(np.isnan(scores.error), np.nan, np.abs(scores.error) < scores.sigma), axis=0)
+        there = ~np.isnan(scores.error[:, 0])
+        inside = 100 * (np.abs(scores.error) < scores.sigma)[there].sum(axis=0) / max(int(there.sum()), 1)
         lines.append(f"| {kind} | {_percents(inside[:3])} | {_percents(inside[3:])} |")
     return "\n".join(lines)
 

@@ -41,8 +41,8 @@ class StepOptions:
     seed: int = 0
     save_every: int = 250
     """Steps between checkpoints."""
-    minutes: float = math.inf
-    """Stop (resumable) after so many minutes of this stretch."""
+    max_steps: int | None = None
+    """Stop, resumable, after so many steps of this stretch."""
 
 
 Losses = dict[str, Tensor]
@@ -102,7 +102,8 @@ def train_steps(
     start = time.process_time()
     mean: dict[str, float] = {}
     low = low_precision(options.precision)
-    while step < options.steps and (time.process_time() - start) / 60 < options.minutes:
+    last = options.steps if options.max_steps is None else min(options.steps, step + options.max_steps)
+    while step < last:
         torch.manual_seed((options.seed << 32) + step)  # dropout of a resumed run is that of an uninterrupted one
         for group in optimizer.param_groups:
             group["lr"] = learning_rate_at(step, options)
@@ -121,7 +122,7 @@ def train_steps(
             "norm": float(norm),
         }.items():
             mean[name] = 0.98 * mean.get(name, value) + 0.02 * value
-        if step % options.save_every == 0 or step == options.steps:
+        if step % options.save_every == 0 or step == last:
             minutes = spent + (time.process_time() - start) / 60
             found = (
                 report(averaged.module, step) if report and (step % report_every == 0 or step == options.steps) else {}

@@ -1,0 +1,63 @@
+"""The preset from rendering to a checkpoint that loads, in a miniature of two steps."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+
+from poet_loc.core.input_error import InputError
+from poet_loc.model.checkpoint import load_model
+from poet_loc.train import embedded_preset
+from poet_loc.train.embedded import EMBEDDED
+from poet_loc.train.embedded_preset import EmbeddedPresetOptions, train_preset
+from poet_loc.train.model_card import MeasureOptions, card_table, measure
+from poet_loc.videos import VideoOptions, render_videos
+
+
+@pytest.fixture(scope="module")
+def checkpoint(tmp_path_factory):
+    out = tmp_path_factory.mktemp("preset")
+    options = EmbeddedPresetOptions(out, 4, 4, detector_steps=1, joint_steps=1, batch=2, jobs=1, precision="float32")
+    return train_preset(options)
+
+
+def test_the_checkpoint_holds_detector_network_names_and_its_history(checkpoint):
+    network, config = load_model(checkpoint)
+    assert network.options == config.network == EMBEDDED
+    assert config.object_names[8] == "bowl"
+    assert config.source["joint"]["step"] == 1
+    assert len(config.source["temperatures"]) == 6
+    assert checkpoint.stat().st_size < 20e6
+
+
+def test_a_second_call_finds_everything_done(checkpoint, monkeypatch):
+    from poet_loc.train import steps
+
+    def fail(*_, **__):
+        raise AssertionError("nothing is left to train")
+
+    monkeypatch.setattr(steps.torch.optim.AdamW, "step", fail)
+    options = EmbeddedPresetOptions(checkpoint.parent, 4, 4, detector_steps=1, joint_steps=1, batch=2, jobs=1)
+    assert train_preset(replace(options, precision="float32")) == checkpoint
+
+
+def test_the_card_counts_every_object_that_was_asked_for(checkpoint, tmp_path):
+    render_videos(VideoOptions(tmp_path, videos=1, duration_s=(2.0, 2.0), jobs=1, progress=False))
+    figures = measure(MeasureOptions(tmp_path, checkpoint))
+    gt = figures.scores["gt"]
+    assert len(gt.object_ids) == len(figures.scores["bb"].object_ids) > 0
+    assert (gt.translation_m < 10).all()
+    table = card_table(figures)
+    assert "| **all** | gt |" in table
+    assert all(f"| {figures.names[int(label)]} | gt |" in table for label in set(gt.object_ids))
+    assert (tmp_path / "video_00" / "object_poses_gt.csv").exists()
+
+
+def test_the_command_refuses_a_split_that_it_would_not_render(tmp_path):
+    from poet_loc.cli.train import Arguments, execute
+    from poet_loc.train.options import DataOptions, TrainOptions
+
+    with pytest.raises(InputError, match="train"):
+        execute(Arguments(TrainOptions(tmp_path, DataOptions(tmp_path / "real")), "embedded"))
+    assert embedded_preset.EmbeddedPresetOptions(tmp_path).joint_steps > 0
