@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any, Literal
@@ -35,6 +36,8 @@ def execute(arguments: Arguments) -> None:
         recipe, loss = RECIPES[arguments.preset]
         options = replace(options, recipe=_over(options.recipe, recipe), loss=_over(options.loss, loss))
     out = train(options)
+    if os.environ.get("RANK", "0") != "0":
+        return  # torchrun started several of us
     names = [name for name in ("best.safetensors", "network.safetensors", "last.pt") if (out / name).exists()]
     print(f"{out}: {', '.join(names)}")
 
