@@ -10,7 +10,7 @@ import trimesh
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from poet_loc.data.world.rasterizer import cover
-from poet_loc.data.world.sampling import random_intrinsics, random_scene, random_view
+from poet_loc.data.world.sampling import look_at, random_intrinsics, random_scene, random_view
 from poet_loc.data.world.view import depth_and_things, load_assets, place, render_image, silhouette
 
 SIZE = (96, 72)
@@ -62,6 +62,23 @@ def test_a_silhouette_is_the_thing_seen_alone(assets):
         assert np.all(alone[thing == index])  # what is seen belongs to the outline
         shifted = silhouette(geometry, index, (-7, -3, SIZE[0] + 7, SIZE[1] + 3))
         np.testing.assert_array_equal(shifted[3:, 7:], alone)
+
+
+def test_the_bowl_looks_the_same_from_all_sides_and_the_can_does_not(assets):
+    rng = np.random.default_rng(4)
+    scene = random_scene(assets, rng)
+    camera = look_at(np.array([0.35, 0.0, 0.3]), np.array([0.0, 0.0, 0.03])).inv()
+
+    def seen(number: int, turns: int) -> np.ndarray:
+        turn = Rotation.from_euler("z", turns * 2 * np.pi / 48)  # the mesh has 48 segments
+        height = -assets.objects[number].mesh.vertices[:, 2].min()
+        T_world_thing = RigidTransform.from_components([[0, 0, height]], Rotation.concatenate([turn]))
+        alone = replace(scene, things=(number,), T_world_thing=T_world_thing, gains=np.ones((1, 3)))
+        return render_image(assets, alone, camera, (200.0, 200.0, 47.5, 35.5), SIZE)
+
+    for turns in (7, 24, 31):
+        assert np.abs(seen(8, turns) - seen(8, 0)).max() < 0.02
+        assert np.abs(seen(3, turns) - seen(3, 0)).max() > 0.2
 
 
 def test_a_triangle_covers_the_samples_inside_it():

@@ -266,7 +266,8 @@ def _bowl(object_id: int, rng: np.random.Generator) -> WorldObject:
     atlas[_pixels(_EXTRA)] = (226, 222, 208)
     outer = [(1e-5, 0.0), (0.035, 0.0), (0.04, 0.004), (0.06, 0.02), (0.073, 0.038), (0.08, 0.055)]
     inner = [(1e-5, 0.006), (0.034, 0.006), (0.057, 0.023), (0.07, 0.04), (0.08, 0.055)]
-    mesh = merge([revolve(outer, _WHOLE_SIDE, None, 48), revolve(inner, _EXTRA, None, 48)]).centred()
+    lining = (0.52, 0.72, 0.86, 0.88)  # far from the patch's rim: no seam tells the turn, at any mip level
+    mesh = merge([revolve(outer, _WHOLE_SIDE, None, 48), revolve(inner, lining, None, 48)]).centred()
     symmetry = Symmetry((0.0, 0.0, 1.0), "continuous")
     return WorldObject(object_id, "bowl", mesh, atlas, symmetry, True, (_UP, _DOWN), 0.4)
 
