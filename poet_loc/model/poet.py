@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor, nn
 
+from poet_loc.core.input_error import InputError
 from poet_loc.model.backbone import Backbone, Features, ImageBatch, mask_of_level
 from poet_loc.model.heads import heads_per_layer, pick_class, rotation_from_6d
 from poet_loc.model.options import NetworkOptions
@@ -146,7 +147,7 @@ class PoET(nn.Module):
         if self.options.query_embedding == "learned":
             count = queries.boxes.shape[1]
             if count != self.options.queries:
-                raise ValueError(f"{count} boxes in an image for {self.options.queries} learned queries")
+                raise InputError(f"{count} boxes in an image for {self.options.queries} learned queries")
             table = self.query_embed.weight[None].expand(len(queries.boxes), -1, -1)
             position, content = table.chunk(2, dim=-1)
             return position, content

@@ -7,6 +7,8 @@ import math
 import torch
 from torch import Tensor, nn
 
+from poet_loc.core.input_error import InputError
+
 
 class SinePositionEncoding(nn.Module):
     """Sines of the row and the column of each cell, counted over the cells that are not padded.
@@ -47,12 +49,13 @@ class LearnedPositionEncoding(nn.Module):
     def forward(self, mask: Tensor) -> Tensor:
         """Encode a padding mask (B, h, w) -> (B, d, h, w), columns first, then rows.
 
-        Raises ValueError for maps with more rows or columns than the table.
+        Raises InputError for maps with more rows or columns than the table.
         """
         batch, height, width = mask.shape
         entries = self.row_embed.num_embeddings
         if max(height, width) > entries:
-            raise ValueError(f"a learned position encoding has {entries} rows and columns, the map is {height}x{width}")
+            what = f"a learned position encoding has {entries} rows and columns, the map is {height}x{width}"
+            raise InputError(what, fix="give smaller images, or use the sine encoding")
         columns = self.col_embed(torch.arange(width, device=mask.device))
         rows = self.row_embed(torch.arange(height, device=mask.device))
         code = torch.cat(

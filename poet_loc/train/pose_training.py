@@ -51,6 +51,8 @@ class _Run:
         ids = self.dataset.object_ids
         self.validation = _validation_set(options, ids)
         self.network, self.config, anew = starting_network(options, ids)
+        if self.config.network.needs_intrinsics and not all(map(math.isfinite, self.dataset.record(0).intrinsics)):
+            raise InputError("tells no intrinsics, which this network needs", path=data.train)
         self.network.to(device)
         trainable(options, self.network)
         share_first(self.network.state_dict().values())

@@ -172,8 +172,19 @@ def test_more_given_boxes_than_queries_widen_the_batch() -> None:
         output = network.poses(random_features(), no_padding(), queries)
     assert output.translation.shape == (2, 7, 3)
     learned = PoET(small_options(query_embedding="learned")).eval()
-    with pytest.raises(ValueError, match="7 boxes in an image for 5 learned queries"):
+    with pytest.raises(InputError, match="7 boxes in an image for 5 learned queries"):
         learned.poses(random_features(), no_padding(), queries)
+
+
+def test_learned_positions_end_at_fifty_cells() -> None:
+    network = PoET(small_options(position_encoding="learned", levels=1, map_channels=(16,), map_strides=(8,))).eval()
+    features = Features((torch.randn(1, 16, 51, 20),), (408, 160))
+    with pytest.raises(InputError, match="50 rows and columns, the map is 51x20"):
+        network.poses(
+            features,
+            torch.zeros(1, 408, 160, dtype=torch.bool),
+            stack_queries([torch.rand(1, 4)], [torch.ones(1).long()], 5),
+        )
 
 
 def test_class_beyond_the_heads_is_an_error() -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 import subprocess
 import sys
 from dataclasses import replace
@@ -39,9 +40,9 @@ def random_rotations(count: int, seed: int = 0) -> torch.Tensor:
     return torch.from_numpy(Rotation.random(count, rng=np.random.default_rng(seed)).as_matrix())
 
 
-def tiny_run(folder: Path, **changes: object) -> TrainOptions:
+def tiny_run(folder: Path, dropout: float = 0.1, **changes: object) -> TrainOptions:
     if not (folder / "start.safetensors").exists():
-        save_tiny(folder / "start.safetensors", dropout=0.1)
+        save_tiny(folder / "start.safetensors", dropout=dropout)
         write_bop_split(folder / "train", 6)
         write_bop_split(folder / "val", 3, seed=1)
     options = TrainOptions(
@@ -123,7 +124,8 @@ def test_detector_boxes_that_find_nothing_do_not_break_training(tmp_path: Path) 
 
 
 def test_two_processes_agree(tmp_path: Path) -> None:
-    tiny_run(tmp_path)
+    options = tiny_run(tmp_path, dropout=0.0, boxes="gt", out=tmp_path / "one")
+    train(replace(options, recipe=replace(options.recipe, batch=4)))
     script = tmp_path / "work.py"
     script.write_text(
         "import sys\nfrom dataclasses import replace\nfrom pathlib import Path\n"
@@ -148,8 +150,31 @@ def test_two_processes_agree(tmp_path: Path) -> None:
     first, second = (torch.load(tmp_path / f"rank{rank}.pt", weights_only=True) for rank in (0, 1))
     torch.testing.assert_close(first, second, atol=0, rtol=0)
     assert len(rows(tmp_path / "two")) == 2  # six images, two processes of two images: one step an epoch
+    norms = [[row["gradient_norm"] for row in rows(tmp_path / name)] for name in ("one", "two")]
+    assert norms[0] == pytest.approx(norms[1], rel=1e-3)  # the same as one process with both shares of each batch
     start, _ = load_model(tmp_path / "start.safetensors")
     assert not torch.equal(first, torch.cat([p.reshape(-1) for p in start.parameters()]))
+
+
+def test_a_network_that_needs_intrinsics_asks_for_them(tmp_path: Path) -> None:
+    tiny_run(tmp_path)
+    save_tiny(tmp_path / "ray.safetensors", translation="ray")
+    (tmp_path / "d/annotations").mkdir(parents=True)
+    shutil.copytree(tmp_path / "train/000001/rgb", tmp_path / "d/train")
+    pose = {"position": [0, 0, 0.5], "rotation": np.eye(3).ravel().tolist()}
+    images = [{"file_name": f"{i:06d}.png", "id": i, "width": 96, "height": 64, "type": "real"} for i in range(1, 7)]
+    objects = [
+        {"id": i, "image_id": i, "relative_pose": pose, "bbox": [9, 9, 20, 20], "category_id": 1 + i % 2}
+        for i in range(1, 7)
+    ]
+    categories = [{"id": i, "name": str(i), "supercategory": ""} for i in range(3)]
+    content = {"images": images, "annotations": objects, "categories": categories}
+    (tmp_path / "d/annotations/train.json").write_text(json.dumps(content))
+    data = DataOptions(tmp_path / "d/annotations/train.json")
+    run = train(tiny_run(tmp_path, data=data, max_steps=1))
+    assert len(rows(run)) == 1
+    with pytest.raises(InputError, match="tells no intrinsics"):
+        train(tiny_run(tmp_path, data=data, start=tmp_path / "ray.safetensors", out=tmp_path / "ray"))
 
 
 def test_published_recipes() -> None:
