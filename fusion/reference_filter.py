@@ -11,9 +11,21 @@ import math
 
 import numpy as np
 from filterpy.kalman import predict, update
+from scipy.spatial.transform import Rotation
 
-from fusion import filter_loop, imu, memory
-from fusion.eskf import ACCEPTED, BIAS_MODEL_SIZE, BIAS_TAU, POSITION_ONLY, REJECTED, ROTATION_ONLY, bias_sigma
+from fusion import filter_loop, imu, memory, odometry
+from fusion.eskf import (
+    ACCEPTED,
+    BIAS_JUMP,
+    BIAS_JUMP_AT,
+    BIAS_MODEL_SIZE,
+    BIAS_TAU,
+    POSITION_ONLY,
+    REJECTED,
+    ROTATION_ONLY,
+    bias_sigma,
+    forget_bias,
+)
 from fusion.fuse import run_filter
 from fusion.measurements import OBJECT_POSE
 from fusion.nav_state import (
@@ -21,26 +33,34 @@ from fusion.nav_state import (
     GYRO_BIAS,
     OBJECT_SIZE,
     OBJECTS,
+    POSITION,
     TIME_OFFSET,
+    VELOCITY,
     Array,
     Ints,
+    pose_at,
+    put_pose,
     retract_state,
 )
 from fusion.options import FuseOptions
 from fusion.prepare import Problem
 from fusion.reference_models import (
+    ATT,
     BOTH,
+    POS,
     POSITION_ROWS,
     ROTATION_ROWS,
     exp,
     layout_from_integers,
     nearest_symmetric,
+    odometry_transition,
     process_noise,
     residual_and_jacobian,
     transition,
     transport,
 )
 from fusion.result import FuseResult
+from poet_loc.core.geometry import make_pose
 
 Columns = tuple[Ints, Ints, Array, Array, Array]
 """kinds (M,), objects (M,), rotations (M, 9), translations (M, 3), covariances (M, 6, 6)"""
@@ -49,6 +69,10 @@ Columns = tuple[Ints, Ints, Array, Array, Array]
 def run_reference(problem: Problem, options: FuseOptions) -> FuseResult:
     """Run the plain filter over a whole log: the same numbers as `fuse.run_filter`, some hundred times slower."""
     return run_filter(problem, options, loop=run_log, estimator="reference")
+
+
+def _within(whole: slice, part: slice) -> slice:
+    return slice(whole.start + part.start, whole.start + part.stop)
 
 
 class ReferenceFilter:
@@ -67,13 +91,16 @@ class ReferenceFilter:
 
     def advance(self, imu_stamps: Ints, imu_values: Array, until: int) -> None:
         """Integrate the IMU, linear in time between samples, up to a stamp."""
-        c = self.m.counters
+        m, c = self.m, self.m.counters
         while c[memory.NOW] < until:
             k, now = c[memory.IMU_AT], c[memory.NOW]
             stop = min(imu_stamps[k + 1], until)
             middle = 0.5 * ((now - imu_stamps[k]) + (stop - imu_stamps[k]))
             share = middle / (imu_stamps[k + 1] - imu_stamps[k])
-            self._step((stop - now) * 1e-9, imu_values[k] + share * (imu_values[k + 1] - imu_values[k]))
+            if m.noise[odometry.IS_ODOMETRY]:
+                self._step_by_odometry((stop - now) * 1e-9, imu_values[k])
+            else:
+                self._step((stop - now) * 1e-9, imu_values[k] + share * (imu_values[k + 1] - imu_values[k]))
             c[memory.NOW] = stop
             c[memory.IMU_AT] += stop == imu_stamps[k + 1]
 
@@ -86,8 +113,20 @@ class ReferenceFilter:
         m.x[:], F = transition(m.x, dt, values[:3], values[3:], self.layout)
         _, m.P[:] = predict(self.zero, m.P, F, process_noise(self.layout.n_error, dt, m.noise))
 
+    def _step_by_odometry(self, dt: float, twist: Array) -> None:
+        m = self.m
+        m.x[:], F = odometry_transition(m.x, dt, twist[:3], twist[3:], self.layout)
+        if self.tracking:
+            Q = np.zeros_like(F)
+            Q[ATT, ATT] = m.noise[odometry.ROTATION_WALK] ** 2 * dt * np.eye(3)
+            Q[POS, POS] = m.noise[odometry.TRANSLATION_WALK] ** 2 * dt * np.eye(3)
+            _, m.P[:] = predict(self.zero, m.P, F, Q)
+
     def decay_biases(self) -> None:
-        """Let the object biases relax since the last measurement: Gauss-Markov, x <- phi x, P <- Phi P Phi + Q."""
+        """Let the object biases relax since the last measurement: Gauss-Markov, x <- phi x, P <- Phi P Phi + Q.
+
+        A bias far outside its sigma is a gross error in a run: it does not fade, and wanders as far as it jumps.
+        """
         m, c, layout = self.m, self.m.counters, self.layout
         seconds = (c[memory.NOW] - c[memory.BIAS_TIME]) * 1e-9
         c[memory.BIAS_TIME] = c[memory.NOW]
@@ -95,13 +134,19 @@ class ReferenceFilter:
             return
         Phi, Q = np.eye(layout.n_error), np.zeros((layout.n_error, layout.n_error))
         for kind in range(layout.bias_kinds):
-            phi = math.exp(-seconds / m.bias_model[kind * BIAS_MODEL_SIZE + BIAS_TAU])
-            sigma = np.array([bias_sigma(m.bias_model, kind, i) for i in range(6)])
+            model = m.bias_model[kind * BIAS_MODEL_SIZE : (kind + 1) * BIAS_MODEL_SIZE]
+            phi = math.exp(-seconds / model[BIAS_TAU])
             for k in range(layout.n_objects):
-                part = layout.error_slice("biases", k, kind)
-                m.x[layout.nominal_bias(k, kind)] *= phi
-                Phi[part, part] = phi * np.eye(6)
-                Q[part, part] = np.diag((1.0 - phi**2) * sigma**2)
+                for part in (ROTATION_ROWS, POSITION_ROWS):
+                    sigma = np.array([bias_sigma(m.bias_model, kind, i) for i in range(6)])[part]
+                    rows = _within(layout.error_slice("biases", k, kind), part)
+                    bias = m.x[_within(layout.nominal_bias(k, kind), part)]
+                    if np.max(np.abs(bias) / sigma) <= model[BIAS_JUMP_AT] or phi == 1.0:
+                        bias *= phi
+                        Phi[rows, rows] = phi * np.eye(3)
+                    else:
+                        sigma = sigma * model[BIAS_JUMP]
+                    Q[rows, rows] = np.diag((1.0 - phi**2) * sigma**2)
         _, m.P[:] = predict(self.zero, m.P, Phi, Q)
 
     def gate(self, residual: Array, S: Array, nis: Array) -> int:
@@ -124,6 +169,8 @@ class ReferenceFilter:
         m, R_m, R = self.m, rotations[j].reshape(3, 3), covariances[j]
         if kind == OBJECT_POSE:
             R = R * m.scales[k]
+            if not m.known[k]:
+                return self._meet_object(k, R_m, t_m, R, rate)
             if m.orders[k] != 1:
                 R_m, R = self._fit_symmetry(k, R_m, R, rate)
         offset = m.limits[filter_loop.NOMINAL_OFFSET]
@@ -143,6 +190,33 @@ class ReferenceFilter:
         m.x[:] = retract_state(before, error, self.layout)
         G = transport(before, m.x, error, self.layout)
         m.P[:] = G @ P @ G.T
+
+    def _meet_object(self, k: int, R_m: Array, t_m: Array, R: Array, rate: Array) -> int:
+        """Place an object whose pose in the world is unknown where its first detection sees it.
+
+        With 0 = H_x dx + H_o do + e its error is do = G dx - H_o^-1 e with G = -H_o^-1 H_x.
+        """
+        m, layout, x = self.m, self.layout, self.m.x
+        if not layout.objects:
+            return REJECTED
+        offset, at = m.limits[filter_loop.NOMINAL_OFFSET], OBJECTS + OBJECT_SIZE * k
+        T_world_imu = make_pose(
+            Rotation.from_matrix(x[:9].reshape(3, 3) @ exp((x[TIME_OFFSET] - offset) * rate)),
+            x[POSITION : POSITION + 3] + (x[TIME_OFFSET] - offset) * x[VELOCITY : VELOCITY + 3],
+        )
+        put_pose(x, at, T_world_imu * pose_at(x, EXTRINSIC_ROTATION) * make_pose(Rotation.from_matrix(R_m), t_m))
+        for first in (0, 3) if layout.bias_kinds else ():
+            forget_bias(x, m.P, k, first, m.bias_model, m.layout)
+        _, H = residual_and_jacobian(OBJECT_POSE, k, R_m, t_m, x, rate, offset, layout)
+        rows = layout.error_slice("objects", k)
+        inverse = np.linalg.inv(H[:, rows])
+        H[:, rows] = 0.0
+        P = m.P.copy()
+        m.P[rows] = -inverse @ H @ P
+        m.P[:, rows] = m.P[rows].T
+        m.P[rows, rows] = inverse @ (H @ P @ H.T + R) @ inverse.T
+        m.known[k] = 1.0
+        return ACCEPTED
 
     def _fit_symmetry(self, k: int, R_m: Array, R: Array, rate: Array) -> tuple[Array, Array]:
         """Turn a measured rotation to the look-alike that fits best; a continuous symmetry says nothing of its turn."""

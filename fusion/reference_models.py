@@ -100,6 +100,23 @@ def transition(x: Array, dt: float, rate: Array, force: Array, layout: StateLayo
     return moved, F
 
 
+def odometry_transition(x: Array, dt: float, rate: Array, velocity: Array, layout: StateLayout) -> tuple[Array, Array]:
+    """Return the state after `dt` seconds of a constant twist (rad/s, m/s in body axes) and the dense F (n, n).
+
+    R <- R Exp(w dt), p <- p + R J_l(w dt) v dt; the velocity is the twist's, its error stays as it is.
+    """
+    R, w = x[:9].reshape(3, 3), rate * dt
+    step = so3_left_jacobian(w) @ velocity * dt
+    moved = x.copy()
+    moved[:9] = (Rotation.from_matrix(R) * Rotation.from_rotvec(w)).as_matrix().ravel()
+    moved[POSITION : POSITION + 3] += R @ step
+    moved[VELOCITY : VELOCITY + 3] = R @ exp(w) @ velocity
+    F = np.eye(layout.n_error)
+    F[ATT, ATT] = exp(-w)
+    F[POS, ATT] = -R @ skew(step)
+    return moved, F
+
+
 def process_noise(n: int, dt: float, noise: Array) -> Array:
     """Return the dense Q (n, n) of `dt` seconds, Sola eq. 261 with the position integrated; a long dt is a gap."""
     Q, I = np.zeros((n, n)), np.eye(3)  # noqa: E741

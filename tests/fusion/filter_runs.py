@@ -36,11 +36,13 @@ class FilterRun:
     memory: memory.Memory
 
 
-def simulated(measurements: str = "objects", layout: StateLayout | None = None, **simulation) -> Problem:
+def simulated(
+    measurements: str = "objects", layout: StateLayout | None = None, options: FuseOptions | None = None, **simulation
+) -> Problem:
     """Return a problem of six seconds at low rates: three objects, one of them a can."""
     wanted = {"duration_s": 6.0, "imu_rate_hz": 100.0, "camera_rate_hz": 15.0, "objects": 3, "symmetric_objects": 1}
     log = simulate(SimulationOptions(**(wanted | {"camera_poses": measurements == "camera"} | simulation)))
-    problem = pose_problem(log, FuseOptions(measurements=measurements))
+    problem = pose_problem(log, options or FuseOptions(measurements=measurements))
     return problem if layout is None else replace(problem, layout=layout)
 
 

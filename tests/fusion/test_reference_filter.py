@@ -10,7 +10,7 @@ from filter_runs import LAYOUTS, assert_same, run, simulated
 
 from fusion import filter_loop, memory, reference_filter
 from fusion.fuse import run_filter
-from fusion.options import FuseOptions, Gate
+from fusion.options import DetectionNoise, Estimate, FuseOptions, Gate
 from fusion.prepare import pose_problem
 from poet_loc.io.log_folder import read_log
 
@@ -40,6 +40,23 @@ def test_compiled_is_plain_through_an_imu_gap_and_with_noise_that_adapts():
     compiled, plain = (run(loop, problem, options) for loop in (filter_loop.run_log, reference_filter.run_log))
     assert_same(compiled, plain)
     assert np.any(compiled.memory.scales > 1.0)
+
+
+def test_compiled_is_plain_on_an_unknown_map():
+    options = FuseOptions(estimate=Estimate(map="unknown", extrinsics=True), noise=DetectionNoise(rotation_deg=2.0))
+    problem = simulated(noise="white", options=options, covariances=False, symmetric_objects=0)
+    compiled, plain = (run(loop, problem, options) for loop in (filter_loop.run_log, reference_filter.run_log))
+    assert_same(compiled, plain)
+    assert np.all(compiled.memory.known == 1.0)
+
+
+@pytest.mark.parametrize("motion", ["odometry", "constant-velocity"])
+def test_compiled_is_plain_without_an_imu(motion):
+    options = FuseOptions(motion=motion)
+    problem = simulated(noise="white", options=options, odometry=True)
+    compiled, plain = (run(loop, problem, options) for loop in (filter_loop.run_log, reference_filter.run_log))
+    assert_same(compiled, plain)
+    assert np.count_nonzero(compiled.decisions) > 50
 
 
 def test_run_reference_returns_what_run_filter_returns():

@@ -1,0 +1,333 @@
+"""The filter as a robot runs it: fed sample by sample, in any order within a horizon, asked for its state at any time.
+
+No threads, no waiting: each call returns when everything that can be said by then has been worked out, in one compiled
+call. A pose waits until the IMU has reached its stamp. What comes late is put in its place (`fusion/replay.py`), so the
+numbers are those of `fuse.run_filter` on the whole log, whatever the order of arrival.
+
+    estimator = Estimator(calibration, landmark_map)
+    estimator.feed_imu(stamp_ns, angular_velocity, specific_force)
+    estimator.feed_object_poses(stamp_ns, object_ids, positions, q_xyzw)
+    state = estimator.state()  # None until it has started
+"""
+
+from __future__ import annotations
+
+import math
+import operator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal, SupportsIndex
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.spatial.transform import RigidTransform, Rotation
+
+from fusion import memory, replay, replay_memory
+from fusion.eskf import POSITION_ONLY, ROTATION_ONLY
+from fusion.filter_loop import LIMIT_BOTH
+from fusion.measurements import CAMERA_POSE, OBJECT_POSE, Measurements, ray_aligned_covariance
+from fusion.nav_state import ACCEL_BIAS, CORE, GYRO_BIAS, POSITION, VELOCITY, StateLayout
+from fusion.options import FuseOptions
+from fusion.prepare import NEAREST_OBJECT, Problem, fill_memory, layout_for, time_shift_ns
+from poet_loc.core.geometry import make_pose
+from poet_loc.core.input_error import InputError
+from poet_loc.core.records import Calibration, ImuSamples, LandmarkMap
+
+Array = NDArray[np.float64]
+Mode = Literal["initialising", "tracking", "coasting"]
+
+
+@dataclass(frozen=True)
+class OnlineOptions:
+    """How late and how dense the input of an online estimator may be."""
+
+    horizon_s: float = 0.5
+    """What is older than the newest IMU sample by more is refused and counted, s."""
+    ahead_s: float = 2.0
+    """Poses may run ahead of the IMU by so much and wait for it, s."""
+    snapshot_s: float = 0.02
+    """The state is kept so often, s; something late costs the integration since the snapshot before it."""
+    max_imu_rate_hz: float = 1000.0
+    """The buffers hold the horizon at this rate of the IMU, Hz; above it the horizon shrinks."""
+    max_pose_rate_hz: float = 1000.0
+    """The buffers hold so many poses per second, over all objects, Hz; what does not fit is refused and counted."""
+    coasting_after_s: float = 0.5
+    """Without an accepted pose for so long the mode is coasting, s."""
+
+
+@dataclass(frozen=True)
+class OnlineState:
+    """What the filter knows at the stamp of the newest IMU sample."""
+
+    stamp_ns: int
+    R_world_imu: Array
+    """(3, 3)"""
+    position: Array
+    """(3,) p_world_imu, m."""
+    velocity: Array
+    """(3,) in world axes, m/s."""
+    gyroscope_bias: Array
+    """(3,) rad/s."""
+    accelerometer_bias: Array
+    """(3,) m/s^2."""
+    covariance: Array
+    """(15, 15) of [attitude (imu axes), position, velocity (world axes), gyroscope bias, accelerometer bias]."""
+
+    @property
+    def T_world_imu(self) -> RigidTransform:
+        """Pose of the imu in the world."""
+        return make_pose(Rotation.from_matrix(self.R_world_imu), self.position)
+
+    @property
+    def sigmas(self) -> Array:
+        """(15,) 1-sigma of the error state."""
+        return np.sqrt(np.diag(self.covariance).clip(min=0.0))
+
+
+@dataclass(frozen=True)
+class ObjectHealth:
+    """How one object's poses within the horizon fared."""
+
+    poses: int
+    position_accepted: float
+    """Share, NaN without poses."""
+    rotation_accepted: float
+    """Share, NaN without poses."""
+    test_ratio: float
+    """Median NIS over its limit: above 1 most are refused; NaN without poses that met a started filter."""
+
+
+@dataclass(frozen=True)
+class Health:
+    """What became of the input so far."""
+
+    mode: Mode
+    restarts: int
+    """How often the filter was lost and started again."""
+    waiting: int
+    """Poses that wait for the IMU to reach their stamp."""
+    duplicates: int
+    """Samples and poses that were there already: ignored."""
+    too_late: int
+    """Older than the horizon: refused."""
+    too_early: int
+    """Further ahead of the IMU than allowed: refused."""
+    malformed: int
+    """With numbers that are not finite: refused."""
+    overflowed: int
+    """Did not fit into the buffers: refused."""
+    not_in_map: int
+    """Of objects that are not in the map, or behind the camera: ignored."""
+    replays: int
+    """How often something late was put in its place."""
+    objects: dict[tuple[int, int], ObjectHealth]
+    """By (object_id, instance); (-1, 0) for camera poses."""
+
+
+class Estimator:
+    """The error-state filter on an IMU, fed one sample at a time.
+
+    options.measurements says whether poses of objects (needs the map) or of the camera come in; layout switches states
+    on beyond what the options ask for. Raises InputError where calibration or map lack what the filter needs.
+    The first call compiles or loads the kernels: construct it, which does that, before the loop runs.
+    """
+
+    def __init__(
+        self,
+        calibration: Calibration,
+        landmark_map: LandmarkMap | None = None,
+        options: FuseOptions | None = None,
+        online: OnlineOptions | None = None,
+        layout: StateLayout | None = None,
+    ) -> None:
+        self.options, self.online = options or FuseOptions(), online or OnlineOptions()
+        problem = _empty_problem(calibration, landmark_map, self.options, layout)
+        self.layout, self.keys = problem.layout, problem.keys
+        self._floats, self._integers = fill_memory(problem, self.options)
+        self.memory = memory.views.py_func(self._floats, self._integers)
+        self._shift_ns = time_shift_ns(calibration)
+        self._landmarks = _landmark_numbers(self.keys)
+        noise = self.options.camera_noise
+        self._camera_covariance = np.diag(
+            np.repeat(np.array([math.radians(noise.rotation_deg), noise.position]) ** 2, 3)
+        )
+        self._first_state = self._floats[: int(self._integers[memory.END_OF_STATE])].copy()
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget everything that was fed."""
+        o = self.online
+        self._floats[: len(self._first_state)] = self._first_state
+        self.memory.counters[:] = 0
+        poses = int((2.0 * o.horizon_s + o.ahead_s) * o.max_pose_rate_hz) + 2 * replay_memory.BATCH
+        self._ring_floats, self._ring_integers = replay_memory.allocate_ring(
+            self._floats,
+            self._integers,
+            2 * int(o.horizon_s * o.max_imu_rate_hz) + 64,
+            poses,
+            round(o.horizon_s * 1e9),
+            round(o.ahead_s * 1e9),
+            max(1, round(o.snapshot_s * 1e9)),
+        )
+        self._ring = replay_memory.ring_views.py_func(self._ring_floats, self._ring_integers)
+        self._rate, self._force = self._ring.sample[:3], self._ring.sample[3:]
+        self._not_in_map = 0
+        self._feed(replay.POSES, 0, 0)
+
+    def feed_imu(self, stamp_ns: SupportsIndex, angular_velocity: ArrayLike, specific_force: ArrayLike) -> None:
+        """Take in one IMU sample: (3,) rad/s and (3,) m/s^2 in imu axes."""
+        self._rate[:] = angular_velocity
+        self._force[:] = specific_force
+        self._feed(replay.IMU_SAMPLE, operator.index(stamp_ns), 1)
+
+    def feed_object_poses(
+        self,
+        stamp_ns: SupportsIndex,
+        object_ids: ArrayLike,
+        positions: ArrayLike,
+        q_xyzw: ArrayLike,
+        covariances: ArrayLike | None = None,
+        instances: ArrayLike | None = None,
+    ) -> None:
+        """Take in the object poses T_cam_obj of one frame.
+
+        stamp_ns on the camera's clock; object_ids (N,), positions (N, 3) m, quaternions (N, 4) scalar last,
+        covariances (N, 6, 6) of [e_r, e_t] in camera axes (None, or a row of NaN: from the options), instances (N,).
+        Objects that are not in the map are ignored and counted. Raises ValueError for a zero quaternion.
+        """
+        ids = np.atleast_1d(np.asarray(object_ids))
+        t = np.asarray(positions, dtype=float).reshape(len(ids), 3)
+        which = np.zeros(len(ids), dtype=np.int64) if instances is None else np.atleast_1d(np.asarray(instances))
+        landmarks = np.array(
+            [self._landmarks.get((int(i), int(k)), self._landmarks.get((int(i), -1), -1)) for i, k in zip(ids, which)],
+            dtype=np.int64,
+        )
+        usable = (landmarks >= 0) & ~(t[:, 2] <= NEAREST_OBJECT)
+        self._not_in_map += int(len(ids) - np.count_nonzero(usable))
+        R = self._detection_covariances(t, covariances)
+        rotations = Rotation.from_quat(np.asarray(q_xyzw, dtype=float).reshape(len(ids), 4)).as_matrix()
+        rows = np.flatnonzero(usable)
+        self._feed_poses(stamp_ns, OBJECT_POSE, landmarks[rows], rotations[rows], t[rows], R[rows])
+
+    def feed_camera_pose(
+        self, stamp_ns: SupportsIndex, position: ArrayLike, q_xyzw: ArrayLike, covariance: ArrayLike | None = None
+    ) -> None:
+        """Take in a camera pose T_world_cam.
+
+        stamp_ns on the camera's clock, position (3,) m, quaternion (4,) scalar last, covariance (6, 6) of [e_r, e_t]
+        with R = R_true Exp(e_r), t = t_true + e_t (None: from the options). Raises ValueError for a zero quaternion.
+        """
+        R = self._camera_covariance if covariance is None else np.asarray(covariance, dtype=float)
+        rotation = Rotation.from_quat(np.asarray(q_xyzw, dtype=float)).as_matrix()
+        self._feed_poses(stamp_ns, CAMERA_POSE, np.array([-1]), rotation, np.asarray(position, dtype=float), R)
+
+    def state(self) -> OnlineState | None:
+        """Return what is known at the newest IMU sample, None before the start."""
+        m = self.memory
+        if m.counters[memory.MODE] != memory.TRACKING:
+            return None
+        x = m.x[: GYRO_BIAS + 6].copy()
+        return OnlineState(
+            int(m.counters[memory.NOW]),
+            x[:9].reshape(3, 3),
+            x[POSITION : POSITION + 3],
+            x[VELOCITY : VELOCITY + 3],
+            x[GYRO_BIAS : GYRO_BIAS + 3],
+            x[ACCEL_BIAS : ACCEL_BIAS + 3],
+            m.P[:CORE, :CORE].copy(),
+        )
+
+    def health(self) -> Health:
+        """Return the counts of everything that was fed, and how the poses within the horizon fared."""
+        h, counters = self._ring.header, self.memory.counters
+        mode: Mode = "initialising"
+        if counters[memory.MODE] == memory.TRACKING:
+            silent_s = (counters[memory.NOW] - max(counters[memory.LAST_UPDATE], counters[memory.STARTED_AT])) * 1e-9
+            mode = "coasting" if silent_s > self.online.coasting_after_s else "tracking"
+        return Health(
+            mode,
+            int(counters[memory.RESTARTS]),
+            int(h[replay_memory.COUNT] - h[replay_memory.NEXT]),
+            int(h[replay_memory.DUPLICATES]),
+            int(h[replay_memory.TOO_LATE]),
+            int(h[replay_memory.TOO_EARLY]),
+            int(h[replay_memory.MALFORMED]),
+            int(h[replay_memory.OVERFLOWED]),
+            self._not_in_map,
+            int(h[replay_memory.REPLAYS]),
+            self._object_health(),
+        )
+
+    def _object_health(self) -> dict[tuple[int, int], ObjectHealth]:
+        r, h = self._ring, self._ring.header
+        done = slice(0, int(h[replay_memory.NEXT]))
+        recent = r.stamps[done] >= self.memory.counters[memory.NOW] - h[replay_memory.HORIZON]
+        objects, decisions, nis = (column[done][recent] for column in (r.objects, r.decisions, r.nis))
+        limit, found = self.memory.limits[LIMIT_BOTH], {}
+        for k, key in enumerate([*self.keys, (-1, 0)]):
+            own = objects == (k if k < len(self.keys) else -1)
+            count = int(np.count_nonzero(own))
+            if key == (-1, 0) and count == 0:
+                continue
+            tested = nis[own, 0][nis[own, 0] > 0.0]
+            found[key] = ObjectHealth(
+                count,
+                float(np.mean((decisions[own] & POSITION_ONLY) > 0)) if count else math.nan,
+                float(np.mean((decisions[own] & ROTATION_ONLY) > 0)) if count else math.nan,
+                float(np.median(tested)) / limit if len(tested) else math.nan,
+            )
+        return found
+
+    def _detection_covariances(self, t: Array, covariances: ArrayLike | None) -> Array:
+        noise, places = self.options.noise, np.where(np.isfinite(t), t, 1.0)
+        sigma = math.radians(noise.rotation_deg)
+        R = ray_aligned_covariance(places, noise.across, noise.along, sigma, noise.floor)
+        if covariances is not None:
+            given = np.asarray(covariances, dtype=float).reshape(R.shape)
+            stated = np.isfinite(given).all(axis=(1, 2))
+            R[stated] = given[stated]
+        return R
+
+    def _feed_poses(
+        self, stamp_ns: SupportsIndex, kind: int, landmarks: NDArray[np.int64], R_m: Array, t_m: Array, R: Array
+    ) -> None:
+        stamp, r = operator.index(stamp_ns) + self._shift_ns, self._ring
+        for first in range(0, len(landmarks), replay_memory.BATCH):
+            rows = slice(first, first + replay_memory.BATCH)
+            n = len(landmarks[rows])
+            r.new_kinds[:n], r.new_objects[:n] = kind, landmarks[rows]
+            r.new_rotations[:n] = R_m.reshape(-1, 9)[rows]
+            r.new_translations[:n] = t_m.reshape(-1, 3)[rows]
+            r.new_covariances[:n] = R.reshape(-1, 6, 6)[rows]
+            self._feed(replay.POSES, stamp, n)
+
+    def _feed(self, what: int, stamp: int, count: int) -> None:
+        replay.feed(self._floats, self._integers, self._ring_floats, self._ring_integers, what, stamp, count)
+
+
+def _empty_problem(
+    calibration: Calibration, landmark_map: LandmarkMap | None, options: FuseOptions, layout: StateLayout | None
+) -> Problem:
+    if options.motion not in ("auto", "imu"):
+        raise InputError(f"the online estimator moves by an IMU, not by {options.motion}", fix="leave --motion out")
+    if calibration.imu is None or calibration.T_cam_imu is None:
+        raise InputError("fusion needs T_cam_imu and the IMU's noise densities", fix="add them to the calibration")
+    if options.measurements == "objects" and landmark_map is None:
+        raise InputError("object poses need a map", fix="give landmark_map, or fuse camera poses")
+    nothing, none = np.empty(0), np.empty(0, dtype=np.int64)
+    return Problem(
+        Path("online"),
+        ImuSamples(none, nothing.reshape(0, 3), nothing.reshape(0, 3)),
+        calibration.imu,
+        calibration,
+        Measurements(none, none, none, nothing.reshape(0, 9), nothing.reshape(0, 3), nothing.reshape(0, 6, 6)),
+        layout or layout_for(landmark_map, options),
+        landmark_map,
+    )
+
+
+def _landmark_numbers(keys: list[tuple[int, int]]) -> dict[tuple[int, int], int]:
+    """Return landmark numbers by (object_id, instance), and by (object_id, -1) where a class has one landmark only."""
+    numbers = {key: k for k, key in enumerate(keys)}
+    ids = [object_id for object_id, _ in keys]
+    return numbers | {(object_id, -1): k for k, object_id in enumerate(ids) if ids.count(object_id) == 1}

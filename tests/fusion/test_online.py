@@ -1,0 +1,257 @@
+"""Fed sample by sample, in order or not, the filter gives the numbers of the whole-log call."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from filter_runs import LAYOUTS, run, simulated
+from scipy.spatial.transform import Rotation
+
+from fusion import filter_loop, memory
+from fusion.measurements import CAMERA_POSE
+from fusion.online import Estimator, OnlineOptions
+from fusion.options import FuseOptions
+from fusion.prepare import Problem, pose_problem
+from poet_loc.core.input_error import InputError
+from poet_loc.io.log_folder import read_log
+
+
+def estimator_for(problem: Problem, options: FuseOptions, online: OnlineOptions | None = None) -> Estimator:
+    estimator = Estimator(problem.calibration, problem.landmark_map, options, online, layout=problem.layout)
+    estimator.memory.prior[estimator.memory.prior == 0.0] = 0.02
+    return estimator
+
+
+def events(problem: Problem) -> list[tuple[int, int, int]]:
+    """Return (stamp, 0 for poses or 1 for an IMU sample, index) in order: poses first, a frame is one event."""
+    frames = np.unique(problem.measurements.stamps_ns)
+    found = [(int(stamp), 0, int(stamp)) for stamp in frames]
+    return sorted(found + [(int(stamp), 1, k) for k, stamp in enumerate(problem.imu.stamps_ns)])
+
+
+def feed(estimator: Estimator, problem: Problem, event: tuple[int, int, int]) -> None:
+    _, what, index = event
+    if what == 1:
+        imu = problem.imu
+        estimator.feed_imu(imu.stamps_ns[index], imu.angular_velocity[index], imu.specific_force[index])
+        return
+    m, shift = problem.measurements, round(problem.calibration.timeshift_cam_imu_s * 1e9)
+    rows = np.flatnonzero(m.stamps_ns == index)
+    q = Rotation.from_matrix(m.rotations[rows].reshape(-1, 3, 3)).as_quat()
+    if m.kinds[rows[0]] == CAMERA_POSE:
+        estimator.feed_camera_pose(index - shift, m.translations[rows[0]], q[0], m.covariances[rows[0]])
+        return
+    keys = np.array(problem.keys)[m.objects[rows]]
+    estimator.feed_object_poses(
+        index - shift, keys[:, 0], m.translations[rows], q, m.covariances[rows], instances=keys[:, 1]
+    )
+
+
+def assert_ends_like(estimator: Estimator, problem: Problem, options: FuseOptions, tolerance: float = 1e-9) -> None:
+    whole = run(filter_loop.run_log, problem, options)
+    assert np.count_nonzero(whole.decisions) > 30
+    np.testing.assert_allclose(estimator.memory.x, whole.memory.x, rtol=tolerance, atol=tolerance)
+    scale = np.sqrt(np.diag(whole.memory.P))
+    np.testing.assert_allclose(
+        estimator.memory.P / np.outer(scale, scale), whole.memory.P / np.outer(scale, scale), rtol=0, atol=tolerance
+    )
+    kept = [memory.NOW, memory.MODE, memory.STARTED_AT, memory.VOTE_HEAD, memory.RESTARTS, memory.LAST_UPDATE]
+    np.testing.assert_array_equal(estimator.memory.counters[kept], whole.memory.counters[kept])
+    np.testing.assert_allclose(estimator.memory.votes, whole.memory.votes, rtol=tolerance, atol=tolerance)
+
+
+def shuffled(problem: Problem, lateness_s: float, rng: np.random.Generator) -> list[tuple[int, int, int]]:
+    """Return the events by arrival: each up to lateness_s late."""
+    in_order = events(problem)
+    late = rng.uniform(0.0, lateness_s * 1e9, len(in_order))
+    return [in_order[i] for i in np.argsort([event[0] + wait for event, wait in zip(in_order, late)])]
+
+
+@pytest.mark.parametrize("measurements", ["camera", "objects"])
+def test_every_state_is_the_whole_logs_row(measurements):
+    problem, options = simulated(measurements, noise="network"), FuseOptions(measurements=measurements)
+    whole = run(filter_loop.run_log, problem, options)
+    rows = {int(stamp): i for i, stamp in enumerate(whole.stamps)}
+    estimator, seen = estimator_for(problem, options), 0
+    for event in events(problem):
+        feed(estimator, problem, event)
+        state = estimator.state()
+        if event[1] == 0:
+            continue
+        assert (state is None) == (event[0] not in rows)
+        if state is not None:
+            row = rows[state.stamp_ns]
+            np.testing.assert_allclose(state.position, whole.core[row, 9:12], rtol=1e-9, atol=1e-9)
+            np.testing.assert_allclose(state.R_world_imu.ravel(), whole.core[row, :9], rtol=1e-9, atol=1e-9)
+            np.testing.assert_allclose(state.sigmas, whole.sigma[row], rtol=1e-9)
+            seen += 1
+    assert seen > 200
+    assert_ends_like(estimator, problem, options)
+
+
+@pytest.mark.parametrize("layout", ["no biases", "everything"])
+@pytest.mark.parametrize("seed", [0, 1])
+def test_shuffled_input_gives_the_in_order_result(layout, seed):
+    problem, options = simulated(layout=LAYOUTS[layout], noise="network", timeshift_cam_imu_s=0.013), FuseOptions()
+    estimator = estimator_for(problem, options, OnlineOptions(horizon_s=0.4))
+    for event in shuffled(problem, 0.4, np.random.default_rng(seed)):
+        feed(estimator, problem, event)
+    assert_ends_like(estimator, problem, options)
+    health = estimator.health()
+    assert health.too_late == 0
+    assert health.replays > 50
+
+
+def test_poses_that_are_always_late_give_the_in_order_result():
+    problem, options = simulated("camera"), FuseOptions(measurements="camera")
+    delayed = sorted(events(problem), key=lambda event: event[0] + (50_000_000 if event[1] == 0 else 0))
+    estimator = estimator_for(problem, options)
+    for event in delayed:
+        feed(estimator, problem, event)
+    assert_ends_like(estimator, problem, options)
+
+
+def test_duplicates_are_ignored_and_counted():
+    problem, options = simulated(noise="network"), FuseOptions()
+    estimator, rng, sent = estimator_for(problem, options), np.random.default_rng(3), 0
+    history: list[tuple[int, int, int]] = []
+    for event in events(problem):
+        feed(estimator, problem, event)
+        history.append(event)
+        if rng.uniform() < 0.3:
+            again = history[-1 - rng.integers(0, min(10, len(history)))]
+            feed(estimator, problem, again)
+            sent += 1 if again[1] == 1 else int(np.count_nonzero(problem.measurements.stamps_ns == again[2]))
+    assert_ends_like(estimator, problem, options)
+    assert estimator.health().duplicates == sent > 100
+
+
+def test_what_is_too_late_is_refused_and_counted():
+    problem, options = simulated("camera"), FuseOptions(measurements="camera")
+    in_order = events(problem)
+    estimator = estimator_for(problem, options, OnlineOptions(horizon_s=0.1))
+    for event in in_order:
+        feed(estimator, problem, event)
+    before = estimator.memory.x.copy()
+    too_old = problem.imu.stamps_ns[-1] - 100_000_001
+    for event in [event for event in in_order if event[0] <= too_old][-20:]:
+        feed(estimator, problem, event)
+    assert estimator.health().too_late == 20
+    np.testing.assert_array_equal(estimator.memory.x, before)
+
+
+def test_gaps_and_jitter():
+    rng, problem, options = np.random.default_rng(7), simulated("camera"), FuseOptions(measurements="camera")
+    stamps = problem.imu.stamps_ns
+    kept = (stamps < stamps[300]) | (stamps > stamps[380])
+    moved = stamps[kept] + rng.integers(-2_000_000, 2_000_000, np.count_nonzero(kept))
+    imu = problem.imu[kept]
+    problem = replace(problem, imu=replace(imu, stamps_ns=moved))
+    estimator = estimator_for(problem, options)
+    for event in shuffled(problem, 0.2, rng):
+        feed(estimator, problem, event)
+    assert_ends_like(estimator, problem, options)
+
+
+def test_a_restart_undone_by_late_input_leaves_no_trace():
+    """Wrong poses all through a second make the filter start anew; they come late, in shreds and in the wrong order."""
+    problem, options = simulated("camera", duration_s=8.0), FuseOptions(measurements="camera")
+    options = replace(options, start=replace(options.start, lost_window_s=0.8, lost_min_votes=6))
+    m = problem.measurements
+    translations, half = m.translations.copy(), len(m) // 2
+    translations[half:] += [1.0, 0.5, 0.0]
+    problem = replace(problem, measurements=replace(m, translations=translations))
+    whole = run(filter_loop.run_log, problem, options)
+    assert whole.memory.counters[memory.RESTARTS] > 0
+    estimator = estimator_for(problem, options, OnlineOptions(horizon_s=1.5))
+    for event in shuffled(problem, 1.5, np.random.default_rng(0)):
+        feed(estimator, problem, event)
+    assert_ends_like(estimator, problem, options)
+
+
+def test_small_buffers_are_emptied_in_time():
+    problem, options = simulated("camera"), FuseOptions(measurements="camera")
+    online = OnlineOptions(horizon_s=0.3, ahead_s=0.4, max_imu_rate_hz=100.0, max_pose_rate_hz=1.0)
+    estimator = estimator_for(problem, options, online)
+    for event in shuffled(problem, 0.3, np.random.default_rng(1)):
+        feed(estimator, problem, event)
+    assert estimator.health().overflowed == 0
+    assert_ends_like(estimator, problem, options)
+
+
+def test_a_faster_imu_than_the_buffers_are_made_for_still_runs():
+    problem, options = simulated("camera", imu_rate_hz=500.0), FuseOptions(measurements="camera")
+    estimator = estimator_for(problem, options, OnlineOptions(horizon_s=0.5, max_imu_rate_hz=50.0))
+    for event in events(problem):
+        feed(estimator, problem, event)
+    assert_ends_like(estimator, problem, options)
+
+
+def test_broken_numbers_and_unknown_objects_change_nothing():
+    problem, options = simulated(noise="white"), FuseOptions()
+    estimator = estimator_for(problem, options)
+    for k, event in enumerate(events(problem)):
+        feed(estimator, problem, event)
+        if k % 50 == 0:
+            stamp = event[0] + 1
+            estimator.feed_imu(stamp, [np.nan, 0.0, 0.0], [0.0, 0.0, 9.81])
+            estimator.feed_object_poses(stamp, [1], [[0.0, np.inf, 1.0]], [[0.0, 0.0, 0.0, 1.0]])
+            estimator.feed_object_poses(stamp, [999], [[0.0, 0.0, 1.0]], [[0.0, 0.0, 0.0, 1.0]])
+            estimator.feed_object_poses(stamp + 10_000_000_000, [1], [[0.0, 0.0, 1.0]], [[0.0, 0.0, 0.0, 1.0]])
+    assert_ends_like(estimator, problem, options)
+    health = estimator.health()
+    assert health.malformed == 2 * health.not_in_map
+    assert health.too_early == health.not_in_map > 10
+    assert health.mode == "tracking"
+
+
+def test_health_tells_of_accepted_poses_and_of_silence():
+    problem, options = simulated(noise="white"), FuseOptions()
+    estimator = estimator_for(problem, options)
+    assert estimator.health().mode == "initialising"
+    assert estimator.state() is None
+    for event in events(problem):
+        feed(estimator, problem, event)
+    for health in estimator.health().objects.values():
+        assert health.poses == 0 or health.position_accepted > 0.7
+        assert health.poses == 0 or 0.0 < health.test_ratio < 1.0
+    imu, last = problem.imu, int(problem.imu.stamps_ns[-1])
+    for k in range(1, 101):
+        estimator.feed_imu(last + k * 10_000_000, imu.angular_velocity[-1], imu.specific_force[-1])
+    assert estimator.health().mode == "coasting"
+
+
+def test_reset_forgets_everything():
+    problem, options = simulated("camera"), FuseOptions(measurements="camera")
+    estimator = estimator_for(problem, options)
+    for _ in range(2):
+        for event in events(problem):
+            feed(estimator, problem, event)
+        assert_ends_like(estimator, problem, options)
+        estimator.reset()
+        assert estimator.state() is None
+
+
+def test_the_whole_log_on_real_data(shared_data):
+    log, options = read_log(shared_data / "euroc_v101"), FuseOptions()
+    problem = pose_problem(log, options, object_poses=log.detections()[1])
+    problem = replace(problem, imu=problem.imu[:2500])
+    estimator = estimator_for(problem, options)
+    rng = np.random.default_rng(0)
+    for event in shuffled(problem, 0.3, rng):
+        feed(estimator, problem, event)
+    inside = problem.measurements.stamps_ns <= problem.imu.stamps_ns[-1]
+    assert np.count_nonzero(inside) > 300
+    assert_ends_like(estimator, problem, options)
+
+
+def test_missing_calibration_and_map_are_said_so():
+    problem = simulated("camera")
+    with pytest.raises(InputError, match="noise densities"):
+        Estimator(replace(problem.calibration, imu=None))
+    with pytest.raises(InputError, match="odometry"):
+        Estimator(problem.calibration, None, FuseOptions(measurements="camera", motion="odometry"))
+    with pytest.raises(InputError, match="map"):
+        Estimator(problem.calibration, None, FuseOptions(measurements="objects"))
