@@ -6,7 +6,6 @@ the poses exactly, so the augmented image is one that a real camera could have t
 
 from __future__ import annotations
 
-import json
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,6 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from poet_loc.core.input_error import InputError
+from poet_loc.io.bop import read_bop_scene
+from poet_loc.io.bop_models import read_models_info
 
 Array = NDArray[np.float64]
 
@@ -86,8 +87,8 @@ class Sample:
 
 def load_models(folder: Path, count: int = 400) -> ObjectModels:
     """Read a BOP models folder; classes must be numbered 1..C.  Raises InputError for what does not fit."""
-    info = json.loads((folder / "models_info.json").read_text())
-    ids = sorted(int(key) for key in info)
+    info = read_models_info(folder / "models_info.json")
+    ids = sorted(info)
     if ids != list(range(1, len(ids) + 1)):
         raise InputError(f"objects {ids} are not numbered 1..{len(ids)}", path=folder / "models_info.json")
     points, surface, axes = [], [], np.zeros((len(ids), 3))
@@ -95,9 +96,10 @@ def load_models(folder: Path, count: int = 400) -> ObjectModels:
         vertices, faces = _read_ply(folder / f"obj_{number:06d}.ply")
         surface.append(_spread_over(vertices, faces, 1000, np.random.default_rng(number)))
         points.append(vertices[np.linspace(0, len(vertices) - 1, count).astype(int)])
-        for entry in info[str(number)].get("symmetries_continuous", [])[:1]:
-            axes[number - 1] = entry["axis"]
-    diameters = np.array([info[str(number)]["diameter"] for number in ids]) / 1e3
+        symmetry = info[number].symmetry
+        if symmetry is not None and symmetry.order == "continuous":
+            axes[number - 1] = symmetry.axis
+    diameters = np.array([info[number].diameter_m for number in ids])
     return ObjectModels(np.stack(points), np.stack(surface), diameters, axes)
 
 
@@ -124,36 +126,36 @@ def pack_scene(scene: Path, out: Path) -> None:
     """Pack a BOP scene folder (rgb/*.jpg, depth, mask_visib, JSON) into out, unless it is there."""
     if out.exists():
         return
-    cameras, truth, info = (
-        json.loads((scene / f"{name}.json").read_text()) for name in ("scene_camera", "scene_gt", "scene_gt_info")
-    )
-    numbers = sorted(int(key) for key in truth)
-    jpegs, depths, instances, rows, visible, starts = [], [], [], [], [], [0]
-    for number in numbers:
-        jpegs.append(np.fromfile(scene / "rgb" / f"{number:06d}.jpg", np.uint8))
-        depth = _read(scene / "depth" / f"{number:06d}.png", cv2.IMREAD_UNCHANGED)[::SHRINK, ::SHRINK]
+    read = read_bop_scene(scene)
+    found = read.annotations
+    if found is None or found.visible_fractions is None or read.depth_scales is None:
+        raise InputError("has no scene_gt_info.json or no depth scale", path=scene, fix="give a complete BOP scene")
+    jpegs, depths, instances, starts = [], [], [], [0]
+    for image, scale in zip(read.image_ids.tolist(), read.depth_scales / 0.1):
+        jpegs.append(np.fromfile(scene / "rgb" / f"{image:06d}.jpg", np.uint8))
+        depth = _read(scene / "depth" / f"{image:06d}.png", cv2.IMREAD_UNCHANGED)[::SHRINK, ::SHRINK]
         instance = np.zeros(depth.shape, np.uint8)
-        for row, entry in enumerate(truth[str(number)]):
-            mask = _read(scene / "mask_visib" / f"{number:06d}_{row:06d}.png", cv2.IMREAD_GRAYSCALE)
+        count = int((found.image_ids == image).sum())
+        for row in range(count):
+            mask = _read(scene / "mask_visib" / f"{image:06d}_{row:06d}.png", cv2.IMREAD_GRAYSCALE)
             instance[mask[::SHRINK, ::SHRINK] > 0] = row + 1
-            pose = np.concatenate(
-                [np.reshape(entry["cam_R_m2c"], (3, 3)), np.reshape(entry["cam_t_m2c"], (3, 1)) / 1e3], 1
-            )
-            rows.append((entry["obj_id"], pose))
-            visible.append(info[str(number)][row]["visib_fract"])
-        scale = cameras[str(number)]["depth_scale"] / 0.1
         depths.append(np.minimum(depth * scale, 65535).astype(np.uint16))
         instances.append(instance)
-        starts.append(len(rows))
-    K = np.array([cameras[str(number)]["cam_K"] for number in numbers])[:, [0, 4, 2, 5]]
+        starts.append(starts[-1] + count)
+    arrays = {
+        "jpegs": np.concatenate(jpegs),
+        "jpeg_starts": np.cumsum([0] + [len(jpeg) for jpeg in jpegs]),
+        "depth": np.stack(depths),
+        "instance": np.stack(instances),
+        "intrinsics": read.camera_matrices[:, [0, 1, 0, 1], [0, 1, 2, 2]],
+        "object_starts": np.array(starts),
+        "classes": found.object_ids,
+        "poses": found.T_cam_obj.as_matrix()[:, :3],
+        "visible": found.visible_fractions,
+    }
     partial = out.with_suffix(".partial")
     partial.mkdir(parents=True, exist_ok=True)
-    for name, array in {
-        "jpegs": np.concatenate(jpegs), "jpeg_starts": np.cumsum([0] + [len(jpeg) for jpeg in jpegs]),
-        "depth": np.stack(depths), "instance": np.stack(instances), "intrinsics": K, "object_starts": np.array(starts),
-        "classes": np.array([row[0] for row in rows]), "poses": np.stack([row[1] for row in rows]),
-        "visible": np.array(visible),
-    }.items():  # fmt: skip
+    for name, array in arrays.items():
         np.save(partial / f"{name}.npy", array)
     partial.rename(out)
 
