@@ -9,6 +9,7 @@ from fusion.options import FuseOptions
 from landmarks.options import Mode, SolverOptions
 from poet_loc.cli.arguments import Flat, LogFolder
 from poet_loc.cli.estimates import StageOptions, estimate_log, steps
+from poet_loc.cli.noise_file import with_noise_from
 from poet_loc.cli.run import show
 from poet_loc.cli.run_folder import WRITING_STEPS, write_run
 from poet_loc.cli.terminal import progress
@@ -29,6 +30,8 @@ class Arguments:
     mode: Mode = "robust"
     """Mode of the solver whose camera poses are fused by --measurements camera, if the log brings none of its own."""
     options: Flat[FuseOptions] = field(default_factory=FuseOptions)
+    noise_from: Path | None = None
+    """Noise and bias of the detections from this file, as fit-noise writes it."""
     pictures: bool = True
     """Draw the figures and write the recording for rerun."""
     overwrite: bool = False
@@ -37,7 +40,7 @@ class Arguments:
 
 def execute(arguments: Arguments) -> None:
     """Fuse, print the table and name the files."""
-    options = arguments.options
+    options = with_noise_from(arguments.noise_from, arguments.options)
     stages = StageOptions(solver=SolverOptions(mode=arguments.mode), fusion=options)
     with whole_folder(arguments.out, arguments.overwrite, inputs=[arguments.log]) as folder:
         log = read_log(arguments.log, arguments.detections)

@@ -25,6 +25,7 @@ COMMANDS = {
     "export": "write a pose network as ONNX or OpenVINO",
     "localize": "object poses and a landmark map become camera poses",
     "fuse": "camera or object poses and a motion source become a trajectory with its sigmas",
+    "fit-noise": "white noise and biases of detections, from logs with ground truth",
     "evaluate": "errors of a trajectory against a reference, per axis, APE and RPE",
     "evaluate-poses": "object poses against the truth: ADD, ADD-S, their areas, BOP recalls, per class",
     "table": "the localisation table of one log or several: detections x modes",

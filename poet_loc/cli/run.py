@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 from poet_loc.cli.arguments import Flat, LogFolder
 from poet_loc.cli.estimates import Estimates, StageOptions, estimate_log, steps
+from poet_loc.cli.noise_file import with_noise_from
 from poet_loc.cli.run_folder import WRITING_STEPS, named_files, write_run
 from poet_loc.cli.terminal import print_tables, progress
 from poet_loc.core.input_error import InputError
@@ -27,6 +28,8 @@ class Arguments:
     """The run folder to write."""
     detections: str | None = None
     """NAME of object_poses_NAME.csv; without it object_poses.csv, or the only one there is."""
+    noise_from: Path | None = None
+    """Noise and bias of the detections from this file, as fit-noise writes it."""
     pictures: bool = True
     """Draw the figures and write the recording for rerun."""
     overwrite: bool = False
@@ -36,12 +39,13 @@ class Arguments:
 
 def execute(arguments: Arguments) -> None:
     """Run all stages, print the table and name the files."""
-    fusion, default = arguments.options.fusion, StageOptions().fusion
+    fusion, default = with_noise_from(arguments.noise_from, arguments.options.fusion), StageOptions().fusion
     if (fusion.estimator, fusion.measurements) != (default.estimator, default.measurements):
         raise InputError("run fuses with all estimators", fix="poet-loc fuse takes one --estimator and --measurements")
     with whole_folder(arguments.out, arguments.overwrite, inputs=[arguments.log]) as folder:
         log = read_log(arguments.log, arguments.detections)
-        estimates = run_stages(log, arguments.detections, arguments.options, folder, arguments, arguments.pictures)
+        stages = replace(arguments.options, fusion=fusion)
+        estimates = run_stages(log, arguments.detections, stages, folder, arguments, arguments.pictures)
     show(estimates, arguments.out)
 
 

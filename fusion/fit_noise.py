@@ -1,0 +1,168 @@
+"""Fit the noise of detections to logs with ground truth: what is white, what lasts for seconds, what stays.
+
+The errors of each object (rotation in rad; image shift and stretch of the distance as shares of it, as in
+`fusion/measurements.py`) have the autocovariance  w^2 [lag = 0] + v^2 exp(-lag / tau) + s^2, whose parts are the white
+noise, the varying and the steady bias. Gross errors are left out and counted: the gate and the jumps deal with them.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import least_squares
+
+from fusion.options import DetectionBias, DetectionNoise
+from fusion.prepare import NEAREST_OBJECT, landmark_of_detection
+from poet_loc.core.input_error import InputError
+from poet_loc.core.records import ObjectPoses
+from poet_loc.io.log_folder import Log
+
+Array = NDArray[np.float64]
+Stamps = NDArray[np.int64]
+
+PARTS = {"rotation": slice(0, 3), "across": slice(3, 5), "along": slice(5, 6)}
+
+
+@dataclass(frozen=True)
+class FitNoiseOptions:
+    """What counts as a gross error, and how far correlation is looked at."""
+
+    gross_distance: float = 0.15
+    """A position error beyond this share of the distance is gross."""
+    gross_angle_deg: float = 25.0
+    """A rotation error beyond this is gross, deg."""
+    longest_lag_s: float = 8.0
+    """Autocovariances are fitted up to this lag, s."""
+    min_detections: int = 100
+    """An object with fewer good detections in a log is left out."""
+
+
+@dataclass(frozen=True)
+class FittedPart:
+    """The three parts of one kind of error, 1-sigma: rad for rotation, shares of the distance for the others."""
+
+    white: float
+    varying: float
+    correlation_s: float
+    steady: float
+
+
+@dataclass(frozen=True)
+class FittedNoise:
+    """What a set of logs says of its detections."""
+
+    parts: dict[str, FittedPart]
+    """rotation, across, along."""
+    gross_share: float
+    """Share of the detections that are gross errors."""
+    detections: int
+    """How many the fit stands on."""
+
+    def options(self) -> tuple[DetectionNoise, DetectionBias]:
+        """Return the options that a filter needs to know of it; the noise floor near an object stays the default."""
+        rotation, across, along = (self.parts[name] for name in PARTS)
+        mean_time = float(np.mean([part.correlation_s for part in self.parts.values()]))
+        noise = DetectionNoise(across=across.white, along=along.white, rotation_deg=math.degrees(rotation.white))
+        bias = DetectionBias(
+            across=across.varying,
+            along=along.varying,
+            rotation_deg=math.degrees(rotation.varying),
+            correlation_s=mean_time,
+            steady_across=across.steady,
+            steady_along=along.steady,
+            steady_rotation_deg=math.degrees(rotation.steady),
+        )
+        return noise, bias
+
+
+def fit_noise(
+    logs: Iterable[Log], detections: str | None = None, options: FitNoiseOptions | None = None
+) -> FittedNoise:
+    """Fit the noise of one set of detections (by name) to logs with T_world_cam.tum and a map.
+
+    Raises InputError where a log lacks them, or where too few detections are good.
+    """
+    options = options or FitNoiseOptions()
+    lags = np.arange(1, max(2, round(options.longest_lag_s / _STEP_S))) * _STEP_S
+    sums, counts = np.zeros((6, len(lags) + 1)), np.zeros(len(lags) + 1)
+    good = seen = 0
+    for log in logs:
+        for stamps, errors in _object_errors(log, log.detections(detections)[1]):
+            keep = _is_good(errors, options)
+            seen += len(keep)
+            if np.count_nonzero(keep) < options.min_detections:
+                continue
+            good += int(np.count_nonzero(keep))
+            _add_autocovariance(stamps[keep], errors[keep], sums, counts)
+    if counts[0] == 0:
+        raise InputError(f"no object has {options.min_detections} good detections", fix="give longer logs")
+    covariance = sums / np.maximum(counts, 1)
+    usable = np.r_[True, counts[1:] > options.min_detections]
+    parts = {
+        name: _fit_part(np.asarray(np.mean(covariance[part], axis=0), dtype=float), lags, usable)
+        for name, part in PARTS.items()
+    }
+    return FittedNoise(parts, 1.0 - good / seen, good)
+
+
+_STEP_S = 0.1
+
+
+def _object_errors(log: Log, poses: ObjectPoses) -> Iterator[tuple[Stamps, Array]]:
+    """Yield stamps (N,) and errors (N, 6) [rotation, across x, across y, along] of each object of a log."""
+    if log.T_world_cam is None or log.landmark_map is None:
+        raise InputError("fitting needs T_world_cam.tum and landmarks.json", path=log.path, fix="choose another log")
+    T_world_cam, valid = log.T_world_cam.interpolate(poses.stamps_ns, max_gap_ns=200_000_000)
+    landmark = landmark_of_detection(poses, log.landmark_map)
+    valid &= poses.T_cam_obj.translation[:, 2] > NEAREST_OBJECT
+    for k, thing in enumerate(log.landmark_map):
+        mine = (landmark == k) & valid
+        if thing.symmetry is not None or not mine.any():
+            continue
+        truth = T_world_cam[mine].inv() * thing.T_world_obj
+        measured = poses.T_cam_obj[mine]
+        rotation = (measured.rotation * truth.rotation.inv()).as_rotvec()
+        p, shift = truth.translation, measured.translation - truth.translation
+        along = np.sum(p * shift, axis=1) / np.sum(p * p, axis=1)
+        across = (shift - along[:, None] * p)[:, :2] / p[:, 2:]
+        yield poses.stamps_ns[mine], np.column_stack([rotation, across, along])
+
+
+def _is_good(errors: Array, options: FitNoiseOptions) -> NDArray[np.bool_]:
+    near = np.linalg.norm(errors[:, 3:], axis=1) < options.gross_distance
+    return near & (np.linalg.norm(errors[:, :3], axis=1) < math.radians(options.gross_angle_deg))
+
+
+def _add_autocovariance(stamps: Stamps, errors: Array, sums: Array, counts: Array) -> None:
+    """Add products of errors a lag apart to the bins: bin 0 is lag zero, bin i the lags around i steps."""
+    sums[:, 0] += np.sum(errors**2, axis=0)
+    counts[0] += len(errors)
+    seconds = (stamps - stamps[0]) * 1e-9
+    for i in range(1, len(counts)):
+        j = np.searchsorted(seconds, seconds + i * _STEP_S)
+        inside = j < len(seconds)
+        first, second = np.flatnonzero(inside), j[inside]
+        near = np.abs(seconds[second] - seconds[first] - i * _STEP_S) < _STEP_S / 2
+        sums[:, i] += np.sum(errors[first[near]] * errors[second[near]], axis=0)
+        counts[i] += np.count_nonzero(near)
+
+
+def _fit_part(covariance: Array, lags: Array, usable: NDArray[np.bool_]) -> FittedPart:
+    """Fit v^2 exp(-lag / tau) + s^2 to the autocovariance beyond lag zero; what lag zero has more is white."""
+    total, values = max(float(covariance[0]), 1e-18), covariance[1:][usable[1:]]
+    t = lags[usable[1:]]
+    if len(t) < 3:
+        return FittedPart(math.sqrt(total), 0.0, 1.0, 0.0)
+
+    def misfit(parameters: Array, /) -> Array:
+        v, tau, s = parameters
+        return np.asarray(v * np.exp(-t / tau) + s - values / total)
+
+    found = least_squares(misfit, np.array([0.4, 2.0, 0.3]), bounds=([0.0, 0.2, 0.0], [2.0, 60.0, 2.0]))
+    v, tau, s = (float(value) for value in found.x)
+    white = max(total * (1.0 - v - s), 0.0)
+    return FittedPart(math.sqrt(white), math.sqrt(total * v), tau, math.sqrt(total * s))

@@ -1,0 +1,76 @@
+"""The fitted noise against errors of known make, and against the shared logs."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import RigidTransform, Rotation
+
+from fusion.fit_noise import fit_noise
+from poet_loc.core.geometry import make_pose
+from poet_loc.core.input_error import InputError
+from poet_loc.core.records import Landmark, LandmarkMap, ObjectPoses
+from poet_loc.core.trajectory import Trajectory
+from poet_loc.io.log_folder import Log
+
+WHITE = np.array([0.03, 0.03, 0.03, 0.004, 0.004, 0.015])
+VARYING = np.array([0.05, 0.05, 0.05, 0.006, 0.006, 0.03])
+TAU = 2.0
+
+
+def made_log(seed: int, frames: int = 3000) -> Log:
+    """A camera at rest before one object, whose errors are white noise and a Gauss-Markov bias."""
+    rng = np.random.default_rng(seed)
+    stamps = np.arange(frames, dtype=np.int64) * 33_333_333
+    phi = np.exp(-0.033333333 / TAU)
+    bias, errors = VARYING * rng.normal(size=6), np.zeros((frames, 6))
+    for i in range(frames):
+        bias = phi * bias + np.sqrt(1 - phi**2) * VARYING * rng.normal(size=6)
+        errors[i] = bias + WHITE * rng.normal(size=6)
+    p = np.array([0.0, 0.0, 1.2])
+    t = p + np.column_stack([errors[:, 3] * p[2], errors[:, 4] * p[2], errors[:, 5] * p[2]])
+    T_cam_obj = make_pose(Rotation.from_rotvec(errors[:, :3]), t)
+    zeros = np.zeros(frames, dtype=np.int64)
+    poses = ObjectPoses(stamps, np.arange(frames), zeros + 1, zeros, np.ones(frames), T_cam_obj)
+    world = LandmarkMap((Landmark(1, make_pose(Rotation.identity(), p)),))
+    still = Trajectory(stamps, RigidTransform.from_translation(np.zeros((frames, 3))))
+    return Log(Path("made"), {"": poses}, world, T_world_cam=still)
+
+
+def test_the_parts_of_errors_of_known_make_are_found():
+    fitted = fit_noise([made_log(seed) for seed in range(8)])
+    for name, part in (("rotation", 0), ("across", 3), ("along", 5)):
+        found = fitted.parts[name]
+        assert found.white == pytest.approx(WHITE[part], rel=0.1)
+        assert np.hypot(found.varying, found.steady) == pytest.approx(VARYING[part], rel=0.15)
+        assert found.varying > 2 * found.steady
+    assert fitted.parts["rotation"].correlation_s == pytest.approx(TAU, rel=0.4)
+
+
+def test_gross_errors_are_counted_and_left_out():
+    log = made_log(0)
+    poses = log.object_poses[""]
+    translation = poses.T_cam_obj.translation
+    translation[::10] += [0.0, 0.0, 1.0]
+    spoiled = replace(poses, T_cam_obj=make_pose(poses.T_cam_obj.rotation, translation))
+    clean, found = fit_noise([log]), fit_noise([replace(log, object_poses={"": spoiled})])
+    assert found.gross_share == pytest.approx(0.1, abs=0.01)
+    assert found.parts["along"].white == pytest.approx(clean.parts["along"].white, rel=0.1)
+
+
+def test_without_ground_truth_there_is_nothing_to_fit():
+    with pytest.raises(InputError, match="T_world_cam"):
+        fit_noise([replace(made_log(0, 200), T_world_cam=None)])
+
+
+def test_real_networks_err_mostly_in_depth_and_for_long(shared_data):
+    from poet_loc.io.log_folder import read_log
+
+    log = read_log(shared_data / "ycbv_dope" / "0014", "supervised")
+    parts = fit_noise([log], "supervised").parts
+    lasting = {name: np.hypot(part.varying, part.steady) for name, part in parts.items()}
+    assert lasting["along"] > 2 * lasting["across"]
+    assert all(lasting[name] > parts[name].white for name in parts)
