@@ -103,7 +103,7 @@ def fit_noise(
     covariance = sums / np.maximum(counts, 1)
     usable = np.r_[True, counts[1:] > options.min_detections]
     parts = {
-        name: _fit_part(np.asarray(np.mean(covariance[part], axis=0), dtype=float), lags, usable)
+        name: _fit_part(np.asarray(np.mean(covariance[part], axis=0), dtype=np.float64), lags, usable)
         for name, part in PARTS.items()
     }
     return FittedNoise(parts, 1.0 - good / seen, good)
