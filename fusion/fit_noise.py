@@ -100,12 +100,9 @@ def fit_noise(
             _add_autocovariance(stamps[keep], errors[keep], sums, counts)
     if counts[0] == 0:
         raise InputError(f"no object has {options.min_detections} good detections", fix="give longer logs")
-    covariance = sums / np.maximum(counts, 1)
+    covariance: Array = np.asarray(sums / np.maximum(counts, 1), dtype=np.float64)
     usable = np.r_[True, counts[1:] > options.min_detections]
-    parts = {
-        name: _fit_part(np.asarray(np.mean(covariance[part], axis=0), dtype=np.float64), lags, usable)
-        for name, part in PARTS.items()
-    }
+    parts = {name: _fit_part(covariance[part], lags, usable) for name, part in PARTS.items()}
     return FittedNoise(parts, 1.0 - good / seen, good)
 
 
@@ -151,8 +148,9 @@ def _add_autocovariance(stamps: Stamps, errors: Array, sums: Array, counts: Arra
         counts[i] += np.count_nonzero(near)
 
 
-def _fit_part(covariance: Array, lags: Array, usable: NDArray[np.bool_]) -> FittedPart:
-    """Fit v^2 exp(-lag / tau) + s^2 to the autocovariance beyond lag zero; what lag zero has more is white."""
+def _fit_part(covariances: Array, lags: Array, usable: NDArray[np.bool_]) -> FittedPart:
+    """Average the components of a part and fit v^2 exp(-lag / tau) + s^2 beyond lag zero; what lag zero has more is white."""
+    covariance = np.asarray(covariances.mean(axis=0), dtype=np.float64)
     total, values = max(float(covariance[0]), 1e-18), covariance[1:][usable[1:]]
     t = lags[usable[1:]]
     if len(t) < 3:
