@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
+from typing import cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -102,7 +103,7 @@ def fit_noise(
         raise InputError(f"no object has {options.min_detections} good detections", fix="give longer logs")
     covariance: Array = np.asarray(sums / np.maximum(counts, 1), dtype=np.float64)
     usable = np.r_[True, counts[1:] > options.min_detections]
-    parts = {name: _fit_part(covariance[part], lags, usable) for name, part in PARTS.items()}
+    parts = {name: _fit_part(cast(Array, covariance[part]), lags, usable) for name, part in PARTS.items()}
     return FittedNoise(parts, 1.0 - good / seen, good)
 
 
@@ -149,7 +150,7 @@ def _add_autocovariance(stamps: Stamps, errors: Array, sums: Array, counts: Arra
 
 
 def _fit_part(covariances: Array, lags: Array, usable: NDArray[np.bool_]) -> FittedPart:
-    """Average the components of a part and fit v^2 exp(-lag / tau) + s^2 beyond lag zero; what lag zero has more is white."""
+    """Fit v^2 exp(-lag / tau) + s^2 to the components' mean beyond lag zero; what lag zero has more is white."""
     covariance = np.asarray(covariances.mean(axis=0), dtype=np.float64)
     total, values = max(float(covariance[0]), 1e-18), covariance[1:][usable[1:]]
     t = lags[usable[1:]]
