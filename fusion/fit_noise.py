@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
-from typing import cast
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -103,7 +103,7 @@ def fit_noise(
         raise InputError(f"no object has {options.min_detections} good detections", fix="give longer logs")
     covariance: Array = np.asarray(sums / np.maximum(counts, 1), dtype=np.float64)
     usable = np.r_[True, counts[1:] > options.min_detections]
-    parts = {name: _fit_part(cast(Array, covariance[part]), lags, usable) for name, part in PARTS.items()}
+    parts = {name: _fit_part(covariance[part], lags, usable) for name, part in PARTS.items()}
     return FittedNoise(parts, 1.0 - good / seen, good)
 
 
@@ -149,7 +149,7 @@ def _add_autocovariance(stamps: Stamps, errors: Array, sums: Array, counts: Arra
         counts[i] += np.count_nonzero(near)
 
 
-def _fit_part(covariances: Array, lags: Array, usable: NDArray[np.bool_]) -> FittedPart:
+def _fit_part(covariances: NDArray[np.floating[Any]], lags: Array, usable: NDArray[np.bool_]) -> FittedPart:
     """Fit v^2 exp(-lag / tau) + s^2 to the components' mean beyond lag zero; what lag zero has more is white."""
     covariance = np.asarray(covariances.mean(axis=0), dtype=np.float64)
     total, values = max(float(covariance[0]), 1e-18), covariance[1:][usable[1:]]

@@ -151,7 +151,7 @@ class Estimate:
     """The direction of gravity in the world."""
     map: Literal["known", "approximate", "unknown"] = "known"
     """Object poses: known as they are in the map; approximate: the map with its covariances (or the priors below);
-    unknown: only the first landmark of the map, which anchors the world, the others where they are first seen."""
+    unknown: only that of the first object seen, which anchors the world, the others where they are first seen."""
 
 
 @dataclass(frozen=True)

@@ -203,8 +203,9 @@ def fill_memory(problem: Problem, options: FuseOptions) -> tuple[Array, NDArray[
     if landmark_map is not None and layout.objects and options.estimate.map == "approximate":
         _map_prior(landmark_map, layout, m.prior)
     m.known[:] = 1.0
-    if options.estimate.map == "unknown":
-        m.known[1:] = 0.0
+    if options.estimate.map == "unknown" and layout.n_objects:
+        m.known[:] = 0.0
+        m.known[_anchor(problem)] = 1.0
     if landmark_map is not None and layout.n_objects:
         for k, landmark in enumerate(landmark_map):
             if landmark.symmetry is not None:
@@ -238,6 +239,18 @@ def _map_prior(landmark_map: LandmarkMap, layout: StateLayout, sigma: Array) -> 
             position = R_world_obj @ landmark.covariance[3:, 3:] @ R_world_obj.T
             variances = np.r_[np.diag(landmark.covariance)[:3], np.diag(position)]
             sigma[layout.error_slice("objects", k)] = np.sqrt(variances)
+
+
+def _anchor(problem: Problem) -> int:
+    """Return the landmark that anchors a world whose map is unknown: the first one seen that says which way it is turned.
+
+    Raises InputError where there is none.
+    """
+    landmarks = [] if problem.landmark_map is None else list(problem.landmark_map)
+    for k in problem.measurements.objects:
+        if landmarks[k].symmetry is None:
+            return int(k)
+    raise InputError("no object without symmetry is seen, so none can anchor the world", path=problem.path)
 
 
 def _limits(options: FuseOptions) -> list[float]:
