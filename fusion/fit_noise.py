@@ -10,7 +10,6 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -88,7 +87,7 @@ def fit_noise(
     Raises InputError where a log lacks them, or where too few detections are good.
     """
     options = options or FitNoiseOptions()
-    lags = np.arange(1, max(2, round(options.longest_lag_s / _STEP_S))) * _STEP_S
+    lags = (np.arange(1, max(2, round(options.longest_lag_s / _STEP_S))) * _STEP_S).astype(np.float64)
     sums, counts = np.zeros((6, len(lags) + 1)), np.zeros(len(lags) + 1)
     good = seen = 0
     for log in logs:
@@ -101,7 +100,7 @@ def fit_noise(
             _add_autocovariance(stamps[keep], errors[keep], sums, counts)
     if counts[0] == 0:
         raise InputError(f"no object has {options.min_detections} good detections", fix="give longer logs")
-    covariance: Array = np.asarray(sums / np.maximum(counts, 1), dtype=np.float64)
+    covariance = sums / np.maximum(counts, 1)
     usable = np.r_[True, counts[1:] > options.min_detections]
     parts = {name: _fit_part(covariance[part], lags, usable) for name, part in PARTS.items()}
     return FittedNoise(parts, 1.0 - good / seen, good)
@@ -149,7 +148,7 @@ def _add_autocovariance(stamps: Stamps, errors: Array, sums: Array, counts: Arra
         counts[i] += np.count_nonzero(near)
 
 
-def _fit_part(covariances: NDArray[np.floating[Any]], lags: Array, usable: NDArray[np.bool_]) -> FittedPart:
+def _fit_part(covariances: Array, lags: Array, usable: NDArray[np.bool_]) -> FittedPart:
     """Fit v^2 exp(-lag / tau) + s^2 to the components' mean beyond lag zero; what lag zero has more is white."""
     covariance = np.asarray(covariances.mean(axis=0), dtype=np.float64)
     total, values = max(float(covariance[0]), 1e-18), covariance[1:][usable[1:]]

@@ -242,7 +242,7 @@ def _map_prior(landmark_map: LandmarkMap, layout: StateLayout, sigma: Array) -> 
 
 
 def _anchor(problem: Problem) -> int:
-    """Return the landmark that anchors a world whose map is unknown: the first one seen that says which way it is turned.
+    """Return the landmark that anchors a world whose map is unknown: the first one seen without a symmetry.
 
     Raises InputError where there is none.
     """
