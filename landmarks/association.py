@@ -23,6 +23,7 @@ Array = NDArray[np.float64]
 Indices = NDArray[np.intp]
 
 _PREVIOUS_WEIGHT = 0.5  # of a vote
+_FREE = 0.25  # what a hypothesis costs whose turn about an axis nobody measured
 _NOBODY = 1.0  # what a detection without a landmark costs: more than any landmark of its class
 _FORBIDDEN = 1e3
 
@@ -113,7 +114,7 @@ class _Associator:
         wanted[:-1] |= unclear[1:]  # the frame before an unclear one is its previous frame
         pairs = self.candidates[wanted[self.frame_of[self.candidates.detections]]]
         hypotheses = self._hypotheses(pairs)
-        totals = self._totals(hypotheses, pairs, ambiguous)
+        totals = self._totals(hypotheses, pairs, ambiguous) + _FREE * hypotheses.free
         R_world_cam, t_world_cam = self._choose(hypotheses, totals)
         for frame in np.flatnonzero(ambiguous):
             mine = pairs[self.frame_of[pairs.detections] == frame]

@@ -38,10 +38,6 @@ class MapArrays:
     def __len__(self) -> int:
         return len(self.object_ids)
 
-    def of_class(self, object_id: int) -> Indices:
-        """Return the landmarks of one class, in the order of the map."""
-        return np.flatnonzero(self.object_ids == object_id)
-
     def nearest_symmetry(self, landmarks: Indices, R_cam_obj: Array, R_expected: Array) -> Array:
         """Return R_cam_obj turned by that symmetry of its landmark which brings it nearest to R_expected.
 

@@ -20,7 +20,6 @@ Array = NDArray[np.float64]
 _SEEDS = 128  # samples that may start the mean, and by which each start is judged
 _STEPS = 50
 _CONVERGED = 1e-12
-_MAD_TO_SIGMA = 1.4826  # of a normal distribution
 
 
 @dataclass(frozen=True)
@@ -32,10 +31,10 @@ class MapOptions:
     inlier_angle_deg: float = 10.0
     """The same for the angle, deg."""
     max_spread_mm: float = 30.0
-    """An object whose world position scatters more (robust 1-sigma of the distance) is refused."""
+    """An object whose world position scatters more (median distance from the mean) is refused."""
     max_spread_deg: float = 5.0
     """The same for its world attitude."""
-    min_inlier_share: float = 0.3
+    min_inlier_share: float = 0.5
     """... and one with a smaller share of samples inside the inlier distance and angle."""
     min_samples: int = 5
     """... and one seen less often."""
@@ -54,7 +53,7 @@ class LandmarkSpread:
     samples: int
     inlier_share: float
     spread_mm: float
-    """Robust 1-sigma: 1.48 times the median distance from the mean."""
+    """Median distance from the mean."""
     spread_deg: float
     refused: str = ""
     """Why the object is not in the map; empty: it is."""
@@ -174,7 +173,7 @@ def _spread(key: tuple[int, int], errors: Array, options: MapOptions) -> Landmar
     angle_deg = np.degrees(np.linalg.norm(errors[:, :3], axis=1))
     distance_mm = 1e3 * np.linalg.norm(errors[:, 3:], axis=1)
     inlier_share = float(np.mean(_square(errors, options) < 1.0))
-    spread_mm, spread_deg = (_MAD_TO_SIGMA * float(np.median(each)) for each in (distance_mm, angle_deg))
+    spread_mm, spread_deg = (float(np.median(each)) for each in (distance_mm, angle_deg))
     reasons = [
         (len(errors) < options.min_samples, f"seen {len(errors)} times only"),
         (inlier_share < options.min_inlier_share, f"only {inlier_share:.0%} of its poses agree"),

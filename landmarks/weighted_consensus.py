@@ -15,9 +15,10 @@ from dataclasses import dataclass, fields
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
+from scipy.stats import chi2
 
 from landmarks.votes import Votes
-from poet_loc.core.geometry import skew
+from poet_loc.core.geometry import skew, so3_right_jacobian_inverse
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.intp]
@@ -29,7 +30,7 @@ _WIDER_START = 4.0  # the first step's gate, in gates
 _LEAST_SUPPORT = 1.0 / 3.0  # of the frame's best consensus
 _MAX_STEPS = 30
 _LONGEST_STEP = 0.5  # rad and m: a pose that some direction leaves nearly free does not fly off
-_CONVERGED = 1e-7  # rad and m
+_CONVERGED = 1e-6  # rad and m
 _SAME_POSE = 1e-5
 _ROWS_AT_ONCE = 16384
 
@@ -135,8 +136,8 @@ def _refined(
             break
         scale = gate * (_WIDER_START if step == 0 else 1.0)
         rows, inverse = votes[frame[active]], information[frame[active]]
-        normal, gradient, _, _ = _normal_equations(rows, inverse, R[active], t[active], scale)
-        change = -np.linalg.solve(normal, gradient[..., None])[..., 0]
+        equations = _normal_equations(rows, inverse, R[active], t[active], scale)
+        change = -np.linalg.solve(equations.normal, equations.gradient[..., None])[..., 0]
         change *= np.minimum(1.0, _LONGEST_STEP / np.maximum(np.abs(change).max(axis=1), 1e-12))[:, None]
         t[active] += np.einsum("mij,mj->mi", R[active], change[:, 3:])
         R[active] = R[active] @ Rotation.from_rotvec(change[:, :3]).as_matrix()
@@ -144,16 +145,28 @@ def _refined(
         active = active[moving | (step == 0)]
     worse = np.flatnonzero(_loss(votes[frame], information[frame], R, t, gate) > before)
     R[worse], t[worse] = votes.R_world_cam[frame, place][worse], votes.t_world_cam[frame, place][worse]
-    normal, _, weights, square = _normal_equations(votes[frame], information[frame], R, t, gate)
-    inside = weights > ACCEPTED_WEIGHT
+    equations = _normal_equations(votes[frame], information[frame], R, t, gate)
+    covariances = _covariances(equations, R)
+    return Hypotheses(frame + first_frame, R, t, equations.weights, covariances)[_first_of_each_pose(frame, R, t)]
+
+
+def _covariances(equations: _NormalEquations, R_world_cam: Array) -> Array:
+    """Return (M, 6, 6) of [e_r, e_t] in the record's axes: the covariance of a weighted mean of independent votes.
+
+    Votes that disagree more than their covariances allow nine times in ten are worth less, in proportion
+    (after R. Birge, Phys. Rev. 40 (1932)).
+    """
+    weights, inside = equations.weights, equations.weights > ACCEPTED_WEIGHT
     freedom = 6.0 * np.maximum(inside.sum(axis=1) - 1, 1)
-    # votes that disagree more than their covariances allow are worth less (R. Birge, Phys. Rev. 40 (1932))
-    excess = np.maximum(1.0, np.sum(np.where(inside, weights * square, 0.0), axis=1) / freedom)
-    to_world = np.zeros_like(normal)
-    to_world[:, :3, :3], to_world[:, 3:, 3:] = np.eye(3), R
-    covariances = excess[:, None, None] * (to_world @ np.linalg.inv(normal) @ np.swapaxes(to_world, -1, -2))
-    covariances = (covariances + np.swapaxes(covariances, -1, -2)) / 2.0
-    return Hypotheses(frame + first_frame, R, t, weights, covariances)[_first_of_each_pose(frame, R, t)]
+    disagreement = np.sum(np.where(inside, equations.square, 0.0), axis=1)
+    excess = np.maximum(1.0, disagreement / chi2.ppf(0.9, freedom))
+    of_mean = np.sum(weights[..., None, None] ** 2 * equations.information, axis=1)
+    inverse = np.linalg.inv(equations.normal)
+    to_world = np.zeros_like(inverse)
+    to_world[:, :3, :3], to_world[:, 3:, 3:] = np.eye(3), R_world_cam
+    factor = to_world @ inverse
+    covariances = excess[:, None, None] * (factor @ of_mean @ np.swapaxes(factor, -1, -2))
+    return (covariances + np.swapaxes(covariances, -1, -2)) / 2.0
 
 
 def _first_of_each_pose(frame: Indices, R: Array, t: Array) -> Indices:
@@ -166,21 +179,35 @@ def _first_of_each_pose(frame: Indices, R: Array, t: Array) -> Indices:
     return np.flatnonzero(~repeated)
 
 
-def _normal_equations(
-    votes: Votes, information: Array, R: Array, t: Array, gate: float
-) -> tuple[Array, Array, Array, Array]:
-    """Return J^T W J (M, 6, 6), J^T W e (M, 6), weights and squared distances (M, K), camera axes.
+@dataclass(frozen=True)
+class _NormalEquations:
+    normal: Array
+    """(M, 6, 6) J^T W J of all votes, in camera axes."""
+    gradient: Array
+    """(M, 6) J^T W e"""
+    information: Array
+    """(M, K, 6, 6) J^T S^-1 J of each vote, without its weight."""
+    weights: Array
+    """(M, K)"""
+    square: Array
+    """(M, K) e^T S^-1 e"""
 
-    With T_world_cam changed to R Exp(a), t + R b: e_r + a and e_t - t_predicted x a + b to first order.
+
+def _normal_equations(votes: Votes, information: Array, R: Array, t: Array, gate: float) -> _NormalEquations:
+    """Return the equations of one step, with T_world_cam changed to R Exp(a), t + R b.
+
+    e_r then becomes e_r + J_r^-1(e_r) a and e_t becomes e_t - t_predicted x a + b, to first order.
     """
     errors, t_predicted = residuals(votes, R, t)
     weighted_errors = np.einsum("mkij,mkj->mki", information, errors)
     square = np.sum(weighted_errors * errors, axis=-1)
     weights = np.where(votes.valid, (gate / (gate + square)) ** 2, 0.0)
     jacobian = np.zeros((*weights.shape, 6, 6))
-    jacobian[...] = np.eye(6)
+    jacobian[..., :3, :3] = so3_right_jacobian_inverse(errors[..., :3])
+    jacobian[..., 3:, 3:] = np.eye(3)
     jacobian[..., 3:, :3] = -skew(t_predicted)
     transposed = np.swapaxes(jacobian, -1, -2)
-    normal = np.sum(weights[..., None, None] * (transposed @ information @ jacobian), axis=1)
+    per_vote = transposed @ information @ jacobian
     gradient = np.sum(weights[..., None] * (transposed @ weighted_errors[..., None])[..., 0], axis=1)
-    return normal, gradient, weights, square
+    normal = np.sum(weights[..., None, None] * per_vote, axis=1)
+    return _NormalEquations(normal, gradient, per_vote, weights, square)

@@ -10,7 +10,7 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from scipy.stats import chi2
 
 from landmarks.camera_pose import SolverOptions
-from poet_loc.core.geometry import make_pose
+from poet_loc.core.geometry import make_pose, skew, so3_right_jacobian_inverse
 from poet_loc.core.records import LandmarkMap, ObjectPoses
 from poet_loc.core.trajectory import Trajectory
 
@@ -109,31 +109,29 @@ def residual(pose: RigidTransform, T_world_obj: RigidTransform, T_cam_obj: Rigid
     return np.concatenate([turned, T_cam_obj.translation - predicted.translation])
 
 
-def _skew(v: np.ndarray) -> np.ndarray:
-    return np.array([[0, -v[2], v[1]], [v[2], 0, -v[0]], [-v[1], v[0], 0]])
-
-
 def _squares(pose: RigidTransform, frame, inverse) -> np.ndarray:
     errors = [residual(pose, T_world_obj, T_cam_obj) for _, T_world_obj, T_cam_obj, _ in frame]
     return np.array([error @ information @ error for error, information in zip(errors, inverse, strict=True)])
 
 
-def _normal_equations(pose: RigidTransform, frame, inverse, scale: float) -> tuple[np.ndarray, np.ndarray]:
-    normal, gradient = np.zeros((6, 6)), np.zeros(6)
+def _normal_equations(pose: RigidTransform, frame, inverse, scale: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    normal, of_mean, gradient = np.zeros((6, 6)), np.zeros((6, 6)), np.zeros(6)
     for (_, T_world_obj, T_cam_obj, _), information in zip(frame, inverse, strict=True):
         error = residual(pose, T_world_obj, T_cam_obj)
         weight = (scale / (scale + error @ information @ error)) ** 2
         jacobian = np.eye(6)
-        jacobian[3:, :3] = -_skew((pose.inv() * T_world_obj).translation)
+        jacobian[:3, :3] = so3_right_jacobian_inverse(error[:3])
+        jacobian[3:, :3] = -skew((pose.inv() * T_world_obj).translation)
         normal += weight * jacobian.T @ information @ jacobian
+        of_mean += weight**2 * jacobian.T @ information @ jacobian
         gradient += weight * jacobian.T @ information @ error
-    return normal, gradient
+    return normal, of_mean, gradient
 
 
 def _refine(start: RigidTransform, frame, inverse, gate: float):
     pose = start
     for step in range(60):
-        normal, gradient = _normal_equations(pose, frame, inverse, gate if step else 4.0 * gate)
+        normal, _, gradient = _normal_equations(pose, frame, inverse, gate if step else 4.0 * gate)
         change = -np.linalg.solve(normal, gradient)
         change *= min(1.0, 0.5 / max(np.abs(change).max(), 1e-12))
         moved = pose.translation + pose.rotation.apply(change[3:])
@@ -144,12 +142,13 @@ def _refine(start: RigidTransform, frame, inverse, gate: float):
         pose = start
     squares = _squares(pose, frame, inverse)
     weights = (gate / (gate + squares)) ** 2
-    normal, _ = _normal_equations(pose, frame, inverse, gate)
+    normal, of_mean, _ = _normal_equations(pose, frame, inverse, gate)
     inside = weights > 0.25
-    excess = max(1.0, float(weights[inside] @ squares[inside]) / (6.0 * max(inside.sum() - 1, 1)))
+    excess = max(1.0, squares[inside].sum() / chi2.ppf(0.9, 6 * max(inside.sum() - 1, 1)))
     to_world = np.eye(6)
     to_world[3:, 3:] = pose.rotation.as_matrix()
-    return pose, weights.sum(), excess * to_world @ np.linalg.inv(normal) @ to_world.T
+    factor = to_world @ np.linalg.inv(normal)
+    return pose, weights.sum(), excess * factor @ of_mean @ factor.T
 
 
 def _loss(pose: RigidTransform, frame, inverse, gate: float) -> float:
