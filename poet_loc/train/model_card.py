@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -69,8 +70,6 @@ class Figures:
 
 def measure(options: MeasureOptions) -> Figures:
     """Run a checkpoint over all videos and compare with the truth."""
-    import json
-
     from poet_loc.data.world.objects import household_objects
     from poet_loc.io.object_poses_csv import write_object_poses
 
@@ -199,3 +198,46 @@ def _row(name: str, kind: str, scores: PoseScores, chosen: NDArray[np.bool_]) ->
 
 def _percents(values: Array) -> str:
     return " ".join(f"{value:.0f} %" for value in values)
+
+
+def full_card(options: MeasureOptions, log: Path) -> str:
+    """Return the whole model card as Markdown: what the checkpoint is, its figures, its curve from log.jsonl."""
+    _, config = load_model(options.weights, with_detector=False)
+    source = config.source
+    stages = ", ".join(
+        f"{name} {entry['step']:.0f} steps in {entry['cpu_minutes']:.0f} CPU minutes"
+        for name, entry in source.items()
+        if isinstance(entry, dict) and "step" in entry
+    )
+    lines = [
+        "# Model card: embedded",
+        "",
+        "Small detector and PoET for the ten rendered household objects (ids 1..10: "
+        + ", ".join(config.object_names)
+        + "), weights in float16.",
+        "",
+        f"- Trained from scratch by `poet-loc train --preset embedded`: {stages}.",
+        f"- Seeds: data 0, weights 0. {source.get('data', '')}".rstrip(),
+        f"- {source.get('machine', '')}".rstrip(),
+        f"- Sigmas calibrated on {source.get('images', '?')} validation images; factors "
+        f"{source.get('temperatures', '?')} (translation x y z, rotation x y z).",
+        "- Knows the rendered world alone: real photographs are another domain.",
+        "",
+        "## Test videos",
+        f"`poet-loc model-card --videos FOLDER`; objects at least {100 * options.least_visible:.0f} % visible, "
+        "missed ones count as infinitely wrong.",
+        "",
+        card_table(measure(options)),
+        "",
+        "## Curve",
+        "Running means of the losses (pose losses summed over the decoder's layers) by optimiser step.",
+        "",
+        "| step | CPU min | centre | depth | rotation | heat | sides | points |",
+        "|--:|--:|--:|--:|--:|--:|--:|--:|",
+    ]
+    rows = [json.loads(line) for line in log.read_text().splitlines()]
+    kept = rows[:: max(len(rows) // 12, 1)]
+    for row in kept if kept[-1] is rows[-1] else [*kept, rows[-1]]:
+        values = " | ".join(f"{row[name]:.3f}" for name in ("centre", "depth", "rotation", "heat", "sides", "points"))
+        lines.append(f"| {row['step']:.0f} | {row['cpu_minutes']:.1f} | {values} |")
+    return "\n".join(lines) + "\n"
