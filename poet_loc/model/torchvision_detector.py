@@ -45,7 +45,7 @@ class TorchvisionDetector(Backbone):
         self.options = options
         model = _build(options)
         self.backbone, self.rpn, self.roi_heads = model.backbone, model.rpn, model.roi_heads
-        self.roi_heads.has_mask = lambda: False
+        self.roi_heads.has_mask = _no_masks
 
     def shape(self) -> BackboneShape:
         """Return three maps of 256 channels at strides 16, 32, 64."""
@@ -86,19 +86,23 @@ class TorchvisionDetector(Backbone):
         return rows[keep]
 
 
+def _no_masks() -> bool:
+    return False
+
+
 def _build(options: TorchvisionOptions) -> Any:
+    """Return torchvision's model with frozen batch norms, as the official weights have them."""
     try:
-        from torchvision.models.detection import fasterrcnn_resnet50_fpn, maskrcnn_resnet50_fpn
+        from torchvision.models.detection import FasterRCNN, MaskRCNN
+        from torchvision.models.detection.backbone_utils import resnet_fpn_backbone
     except Exception as error:  # a wheel of another torch version fails in many ways
         raise InputError(
             f"the {'Mask' if options.masks else 'Faster'} R-CNN backbone needs torchvision, which does not import here"
             f" ({type(error).__name__})",
             fix=f"install the torchvision that belongs to torch {torch.__version__}, or use another backbone",
         ) from error
-    make = maskrcnn_resnet50_fpn if options.masks else fasterrcnn_resnet50_fpn
-    return make(
-        weights=None,
-        weights_backbone=None,
+    return (MaskRCNN if options.masks else FasterRCNN)(
+        resnet_fpn_backbone(backbone_name="resnet50", weights=None),
         num_classes=options.label_count,
         box_score_thresh=options.confidence,
         box_nms_thresh=options.overlap,
