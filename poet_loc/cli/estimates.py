@@ -97,6 +97,9 @@ def estimate_log(
     fused = tuple(_fused(log, name, localized, options, attempt, fusions))
     if not localized and not fused:
         raise attempt.last or InputError("nothing can be estimated of this log", path=log.path)
+    attempt.tell()
+    if fused and fused[0].motion != "imu" and options.fusion.motion == "auto":
+        report.note(f"{log.path}: no imu.csv: fused on {fused[0].motion.replace('-', ' ')} instead")
     evaluation = evaluate_estimates(log, name, _estimates(log, localized, fused), options.evaluation, report)
     return Estimates(log, name, localized, fused, evaluation)
 
@@ -104,13 +107,6 @@ def estimate_log(
 def steps(modes: Sequence[Mode] = MODES, fusions: Sequence[Fusion] = FUSIONS) -> int:
     """Return how many steps `estimate_log` announces at most."""
     return len(modes) + len(fusions) + 1
-
-
-def camera_poses_to_fuse(log: Log, localized: LocalizeResult | None) -> CameraPoses | None:
-    """Return the log's own camera poses, else the solver's without those that only repeat an earlier one."""
-    if log.camera_poses is not None:
-        return log.camera_poses
-    return None if localized is None else localized.estimates.camera_poses[~localized.estimates.held]
 
 
 def evaluate_estimates(
@@ -137,19 +133,23 @@ def evaluate_estimates(
     return evaluate(known, references, span_ns, options, frames_ns)
 
 
-@dataclass
 class _Attempt:
-    """What cannot be done is noted, or raised if strict."""
+    """What cannot be done is raised if strict, else noted: one line for each reason."""
 
-    report: Report
-    strict: bool
-    last: InputError | None = None
+    def __init__(self, report: Report, strict: bool) -> None:
+        self.report, self.strict = report, strict
+        self.last: InputError | None = None
+        self._left_out: dict[str, list[str]] = {}
 
-    def failed(self, error: InputError, consequence: str) -> None:
+    def failed(self, error: InputError, name: str) -> None:
         if self.strict:
             raise error
         self.last = error
-        self.report.note(f"{error}: {consequence}")
+        self._left_out.setdefault(str(error), []).append(name)
+
+    def tell(self) -> None:
+        for reason, names in self._left_out.items():
+            self.report.note(f"{reason}: no {', '.join(names)}")
 
 
 def _localized(
@@ -160,7 +160,7 @@ def _localized(
         try:
             yield localize(log, _localize_options(options, mode, detections))
         except InputError as error:
-            attempt.failed(error, f"no localize/{mode}")
+            attempt.failed(error, f"localize/{mode}")
 
 
 def _fused(
@@ -171,38 +171,27 @@ def _fused(
     attempt: _Attempt,
     fusions: Sequence[Fusion],
 ) -> Iterator[FuseResult]:
-    lacking = _lacking_for_fusion(log)
-    if lacking and fusions:
-        attempt.failed(InputError(lacking, path=log.path), "localisation only")
-        return
     from fusion.fuse import fuse
 
-    solved = {result.name: result for result in localized}.get(f"localize/{options.solver.mode}")
-    camera_poses = camera_poses_to_fuse(log, solved)
+    solved = {result.name: result.estimates for result in localized}.get(f"localize/{options.solver.mode}")
+    # the log's own camera poses come first; of the solver's, those that only repeat an earlier one bring nothing
+    from_solver = solved.camera_poses[~solved.held] if solved is not None and log.camera_poses is None else None
     object_poses = None if detections is None else log.object_poses[detections]
+    there = {"objects": object_poses is not None, "camera": log.camera_poses is not None or from_solver is not None}
     for estimator, measurements in fusions:
+        if not there[measurements] and not attempt.strict:
+            continue
         attempt.report.step(f"fuse {estimator} {measurements}")
         choice = replace(options.fusion, estimator=estimator, measurements=measurements)
         try:
-            yield fuse(log, choice, camera_poses=camera_poses, object_poses=object_poses)
+            yield fuse(log, choice, camera_poses=from_solver, object_poses=object_poses)
         except InputError as error:
-            attempt.failed(error, f"no fuse/{estimator}/{measurements}")
+            attempt.failed(error, f"fuse/{estimator}/{measurements}")
 
 
 def _localize_options(options: SolverOptions, mode: Mode, detections: str | None) -> LocalizeOptions:
     values = {each.name: getattr(options, each.name) for each in fields(SolverOptions)}
     return LocalizeOptions(**values | {"mode": mode}, detections=detections)
-
-
-def _lacking_for_fusion(log: Log) -> str:
-    calibration = log.calibration
-    if log.imu is None:
-        return "no imu.csv"
-    if calibration is None:
-        return "no calibration.yaml"
-    if calibration.T_cam_imu is None:
-        return "no T_cam_imu in calibration.yaml"
-    return "" if calibration.imu is not None else "no imu0 in calibration.yaml"
 
 
 def _estimates(log: Log, localized: Sequence[LocalizeResult], fused: Sequence[FuseResult]) -> tuple[Estimate, ...]:
@@ -216,7 +205,7 @@ def _estimates(log: Log, localized: Sequence[LocalizeResult], fused: Sequence[Fu
         )
         for result in localized
     ]
-    return (*given, *solved, *(Estimate.of_fused(result) for result in fused))
+    return (*given, *solved, *(replace(Estimate.of_fused(result), body=result.body) for result in fused))
 
 
 def _references(log: Log) -> Mapping[Body, Trajectory]:

@@ -60,8 +60,10 @@ def write_localized(folder: Path, result: LocalizeResult) -> None:
 
 
 def write_fused(folder: Path, result: FuseResult) -> None:
-    """Write T_world_imu.tum and states.csv: m, m/s, rad/s, m/s^2; attitude sigmas in rad about the imu's axes."""
-    write_tum(folder / "T_world_imu.tum", result.trajectory)
+    """Write T_world_imu.tum and states.csv; where the log knows no IMU, T_world_cam.tum, if there is none yet."""
+    path = folder / f"T_world_{result.body}.tum"
+    if not path.exists():
+        write_tum(path, result.trajectory)
     write_states(folder / "states.csv", result)
 
 
