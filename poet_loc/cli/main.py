@@ -29,6 +29,7 @@ COMMANDS = {
     "evaluate": "errors of a trajectory against a reference, per axis, APE and RPE",
     "evaluate-poses": "object poses against the truth: ADD, ADD-S, their areas, BOP recalls, per class",
     "table": "the localisation table of one log or several: detections x modes",
+    "check": "say what looks wrong in a log: units, stamps, conventions, extrinsics, map",
     "convert": "bring data from other formats into a log folder",
     "model-card": "figures of a checkpoint on rendered test videos",
     "render": "images or videos of the rendered household world",
@@ -42,8 +43,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     argv = list(sys.argv[1:] if arguments is None else arguments)
     try:
         with _warnings_as_lines():
-            dispatch("poet-loc", COMMANDS, "poet_loc.cli", argv)
+            status = dispatch("poet-loc", COMMANDS, "poet_loc.cli", argv)
             sys.stdout.flush()
+            return status
     except InputError as error:
         return _one_line(str(error), 1)
     except KeyboardInterrupt:
@@ -55,29 +57,26 @@ def main(arguments: Sequence[str] | None = None) -> int:
         if error.filename is None or error.strerror is None:
             raise
         return _one_line(f"{error.filename}: {error.strerror.lower()}", 1)
-    return 0
 
 
-def dispatch(program: str, commands: Mapping[str, str], package: str, argv: Sequence[str]) -> None:
-    """Run the command that argv names, from the module of that name in the package."""
+def dispatch(program: str, commands: Mapping[str, str], package: str, argv: Sequence[str]) -> int:
+    """Run the command that argv names, from the module of that name in the package; return its exit status."""
     name = argv[0] if argv else "--help"
     if name in ("-h", "--help"):
         print(_overview(program, commands))
-        return
+        return 0
     if name == "--version":
         from importlib.metadata import version
 
         print(f"poet-loc {version('poet-loc')}")
-        return
+        return 0
     if name not in commands:
         raise InputError(f"unknown command '{name}'", fix=f"one of {', '.join(commands)}")
     module = import_module(f"{package}.{name.replace('-', '_')}")
     if hasattr(module, "COMMANDS"):
-        dispatch(f"{program} {name}", module.COMMANDS, f"{package}.{name}_commands", argv[1:])
-        return
+        return dispatch(f"{program} {name}", module.COMMANDS, f"{package}.{name}_commands", argv[1:])
     options = read_arguments(f"{program} {name}", module.Arguments, argv[1:])
-    if options is not None:
-        module.execute(options)
+    return 0 if options is None else module.execute(options) or 0
 
 
 def read_arguments(program: str, kind: type, argv: Sequence[str]) -> Any:

@@ -81,7 +81,7 @@ def read_log(path: str | Path, detections: str | None = None) -> Log:
 def read_log_files(path: str | Path, detections: str | None = None) -> Log:
     """Read whatever files of a log a folder has, without asking whether they are enough or belong together."""
     path = Path(path)
-    files = _object_pose_files(path)
+    files = object_pose_files(path)
     if detections is not None:
         if detections not in files:
             raise _no_such_detections(path, detections, sorted(files))
@@ -110,7 +110,7 @@ def write_log(path: str | Path, log: Log) -> None:
     """Write what a log holds into an existing folder."""
     path = Path(path)
     for name, poses in log.object_poses.items():
-        write_object_poses(path / _object_poses_file(name), poses)
+        write_object_poses(path / object_poses_file(name), poses)
     _write_if_there(path / "landmarks.json", log.landmark_map, write_landmarks)
     _write_if_there(path / "camera_poses.csv", log.camera_poses, write_camera_poses)
     _write_if_there(path / "imu.csv", log.imu, write_imu)
@@ -121,7 +121,8 @@ def write_log(path: str | Path, log: Log) -> None:
     _write_if_there(path / "frames.csv", log.frames, write_frames)
 
 
-def _object_pose_files(path: Path) -> dict[str, Path]:
+def object_pose_files(path: Path) -> dict[str, Path]:
+    """Return the files of the sets of detections by name.  Raises InputError where the path is no folder."""
     if not path.is_dir():
         what = "is a file, no log folder" if path.exists() else "does not exist"
         raise InputError(what, path=path, fix=_FIX)
@@ -130,13 +131,14 @@ def _object_pose_files(path: Path) -> dict[str, Path]:
     return {name[1:]: file for file, name in names.items() if name == "" or (name[0] == "_" and name[1:])}
 
 
-def _object_poses_file(name: str) -> str:
+def object_poses_file(name: str) -> str:
+    """Return the file name of a set of detections."""
     return f"{_OBJECT_POSES}_{name}.csv" if name else f"{_OBJECT_POSES}.csv"
 
 
 def _no_such_detections(path: Path, name: str, names: list[str]) -> InputError:
-    there = ", ".join(_object_poses_file(each) for each in names) or "none"
-    return InputError(f"has no {_object_poses_file(name)}", path=path, fix=f"choose among {there}")
+    there = ", ".join(object_poses_file(each) for each in names) or "none"
+    return InputError(f"has no {object_poses_file(name)}", path=path, fix=f"choose among {there}")
 
 
 def _read_if_there(path: Path, read: Callable[[Path], Record]) -> Record | None:
@@ -155,7 +157,7 @@ def _refuse_unknown_objects(log: Log) -> None:
     for name, poses in log.object_poses.items():
         unknown = poses.object_ids[~np.isin(poses.object_ids, known)]
         if unknown.size:
-            file = log.path / _object_poses_file(name)
+            file = log.path / object_poses_file(name)
             what = f"object {unknown[0]} is not in the map (it has {', '.join(map(str, sorted(set(known.tolist()))))})"
             fix = f"add it to {log.path / 'landmarks.json'} or leave its rows out"
             line = line_of_object(file, int(unknown[0])) if file.exists() else None
@@ -179,7 +181,7 @@ def _spans_ns(log: Log) -> Iterator[tuple[str, int, int]]:
     timeshift = log.calibration.timeshift_cam_imu_s if log.calibration else 0.0
     shift_ns = round(timeshift * 1e9)  # t_imu = t_cam + timeshift
     streams: list[tuple[str, Stamps | None, int]] = [
-        *((_object_poses_file(name), poses.stamps_ns, 0) for name, poses in log.object_poses.items()),
+        *((object_poses_file(name), poses.stamps_ns, 0) for name, poses in log.object_poses.items()),
         ("camera_poses.csv", None if log.camera_poses is None else log.camera_poses.stamps_ns, 0),
         ("imu.csv", None if log.imu is None else log.imu.stamps_ns, shift_ns),
         ("T_world_cam.tum", None if log.T_world_cam is None else log.T_world_cam.stamps_ns, 0),

@@ -1,0 +1,1 @@
+"""The doctor: what looks wrong in a log, with the evidence and the fix."""

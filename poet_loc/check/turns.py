@@ -1,0 +1,286 @@
+"""Checks of the gyroscope against turn rates from poses: unit, axes, T_cam_imu, readings of rotations, time offset."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from poet_loc.check.finding import Finding
+from poet_loc.check.turn_rates import (
+    READINGS,
+    Match,
+    PoseSource,
+    Reading,
+    correlation_under,
+    match_turns,
+    pose_sources,
+    reread,
+    turn_rates,
+)
+from poet_loc.core.records import Calibration, ImuSamples
+from poet_loc.core.trajectory import Trajectory
+from poet_loc.io.log_folder import Log, object_poses_file
+
+Direction = Literal["as is", "inverse"]
+
+_TELLING = 0.45  # correlation from which a source is believed
+_MARGIN = 0.25  # by which another hypothesis must fit better ..
+_CLEAN, _CLEAN_MARGIN = 0.97, 0.05  # .. and where it fits as well as this
+_DEGREES = 180.0 / np.pi
+_OFFSET_FLOOR_S, _OFFSET_NOISE_S = 0.005, 0.07
+
+
+@dataclass(frozen=True)
+class _Compared:
+    """A source, its match, and the correlation of each hypothesis."""
+
+    source: PoseSource
+    match: Match
+    """Of the file as it is, or with its rotations the other way round where that fits far better."""
+    as_it_is: Match | None
+    fits: dict[tuple[Reading, Direction], float]
+
+    def best_of(self, direction: Direction) -> float:
+        """Return the best correlation over readings; a reading other than the file's own has to earn it."""
+        return max(fit - 0.05 * (reading != "as is") for (reading, way), fit in self.fits.items() if way == direction)
+
+
+def check_turns(log: Log) -> Iterator[Finding]:
+    """Yield what the turn rates say; nothing where IMU or poses are missing or do not tell."""
+    if log.imu is None or len(log.imu) < 50:
+        return
+    R_cam_imu = None
+    if log.calibration is not None and log.calibration.T_cam_imu is not None:
+        R_cam_imu = log.calibration.T_cam_imu.rotation
+    compared = [each for source in pose_sources(log) if (each := _compare(log.imu, source, R_cam_imu))]
+    if not compared:
+        return
+    mirrored = list(_axes(compared))
+    yield from mirrored
+    yield from _gyroscope_unit(max(compared, key=lambda each: each.match.correlation))
+    if mirrored:
+        return  # no rotation fits mirrored axes: what follows would blame the calibration
+    inverted = _is_inverted(compared)
+    if inverted:
+        yield _inverted_extrinsics(compared)
+    misread_findings = list(_readings(compared, "inverse" if inverted else "as is"))
+    yield from misread_findings
+    if not inverted and R_cam_imu is not None:
+        misread = {finding.file for finding in misread_findings}
+        yield from _rotation_off([each for each in compared if each.source.file not in misread], R_cam_imu)
+    yield from _offsets(log, compared)
+
+
+def _fits_better(fit: float, than: float) -> bool:
+    return fit > than + (_CLEAN_MARGIN if fit > _CLEAN else _MARGIN)
+
+
+def _compare(imu: ImuSamples, source: PoseSource, R_cam_imu: Rotation | None) -> _Compared | None:
+    as_it_is = match = match_turns(imu, turn_rates(source))
+    if match is None or match.correlation < _CLEAN:  # a wrong order of the quaternion turns like an inverse
+        other = match_turns(imu, turn_rates(source, "inverse"))
+        if other is not None and (match is None or other.correlation > match.correlation + 0.01):
+            match = other
+    if match is None or match.correlation < _TELLING or match.correlation < match.background + 0.1:
+        return None
+    ways: dict[Direction, Rotation] = {}
+    if source.body == "imu":
+        ways = {"as is": Rotation.identity()}
+    elif R_cam_imu is not None:
+        ways = {"as is": R_cam_imu.inv(), "inverse": R_cam_imu}
+    fits = {
+        (reading, way): correlation_under(imu, turn_rates(source, reading), match.offset_s, rotation)
+        for reading in READINGS
+        for way, rotation in ways.items()
+    }
+    return _Compared(source, match, as_it_is, fits)
+
+
+def _axes(compared: list[_Compared]) -> Iterator[Finding]:
+    told = [each for each in compared if each.as_it_is is not None]
+    if not told:
+        return
+    best = max(told, key=lambda each: each.as_it_is.mirrored)  # type: ignore[union-attr]
+    match = best.as_it_is
+    assert match is not None
+    margin = 0.02 if match.mirrored > _CLEAN else 0.1
+    if match.mirrored < max(match.correlation, best.match.correlation) + margin:
+        return
+    if any(each.match.correlation > each.as_it_is.mirrored + 0.03 for each in told):  # type: ignore[union-attr]
+        return
+    evidence = {
+        "correlation_best_rotation": match.correlation,
+        "correlation_mirrored": match.mirrored,
+        "against": best.source.file,
+    }
+    what = "the gyroscope's axes are left-handed: one axis has the wrong sign or two are swapped"
+    fix = "turn one axis round (or swap two back), and look at the accelerometer's axes too"
+    yield Finding("axes-mirrored", "error", "imu.csv", what, fix, evidence)
+
+
+def _gyroscope_unit(compared: _Compared) -> Iterator[Finding]:
+    scale = compared.match.gyroscope_scale
+    evidence = {"gyroscope_over_poses": scale, "against": compared.source.file}
+    evidence |= {"correlation": compared.match.correlation}
+    if 0.5 * _DEGREES < scale < 2.0 * _DEGREES:
+        what, fix = (
+            "the gyroscope turns 57 times as fast as the poses: degrees",
+            "multiply by pi/180: rad/s belong here",
+        )
+        yield Finding("gyroscope-degrees", "error", "imu.csv", what, fix, evidence, _gyroscope_in_radians)
+    elif not 0.6 < scale < 1.7 and compared.match.correlation > 0.8:
+        what = "the gyroscope does not turn as fast as the poses"
+        fix = "look at its unit and range setting, and at the unit of the stamps"
+        yield Finding("gyroscope-scale", "error", "imu.csv", what, fix, evidence)
+
+
+def _is_inverted(compared: list[_Compared]) -> bool:
+    telling = [each for each in compared if each.source.body == "cam" and each.fits]
+    if not telling:
+        return False
+    gain = [each.best_of("inverse") - each.best_of("as is") for each in telling]
+    return float(np.mean(gain)) > _MARGIN
+
+
+def _inverted_extrinsics(compared: list[_Compared]) -> Finding:
+    telling = [each for each in compared if each.source.body == "cam"]
+    best = max(telling, key=lambda each: each.best_of("inverse"))
+    evidence = {
+        "correlation_as_written": best.best_of("as is"),
+        "correlation_inverted": best.best_of("inverse"),
+        "against": best.source.file,
+        "sources": len(telling),
+    }
+    what = "T_cam_imu is the other direction: the gyroscope and the poses turn alike only with its inverse"
+    fix = "write the inverse, or name it T_imu_cam; Kalibr's T_cam_imu maps imu coordinates into cam"
+    return Finding("extrinsics-inverted", "error", "calibration.yaml", what, fix, evidence, _inverse_extrinsics)
+
+
+def _readings(compared: list[_Compared], direction: Direction) -> Iterator[Finding]:
+    for each in compared:
+        way: Direction = "as is" if each.source.body == "imu" else direction
+        fits = {reading: each.fits[reading, way] for reading in READINGS if (reading, way) in each.fits}
+        if not fits:
+            continue
+        best = max(fits, key=lambda reading: fits[reading])
+        others = max(fit for reading, fit in fits.items() if reading != best)
+        clear = _fits_better(fits[best], fits["as is"]) and fits[best] > others + _CLEAN_MARGIN
+        if best == "as is" or fits[best] < _TELLING or not clear:
+            continue
+        evidence = {f"correlation_{reading.replace(' ', '_')}": fit for reading, fit in fits.items()}
+        repair = _reread(each.source.file, best)
+        if best == "wxyz":
+            what = "quaternions are written w, x, y, z, it seems: only so they turn as the gyroscope does"
+            fix = "write qx, qy, qz, qw: the scalar comes last"
+            yield Finding("quaternion-order", "error", each.source.file, what, fix, evidence, repair)
+        else:
+            what = "the poses are the other direction, it seems: only inverted they turn as the gyroscope does"
+            name = "T_cam_obj" if each.source.of_object else f"T_world_{each.source.body}"
+            yield Finding("poses-inverted", "error", each.source.file, what, f"write {name}", evidence, repair)
+
+
+def _rotation_off(compared: list[_Compared], R_cam_imu: Rotation) -> Iterator[Finding]:
+    telling = [each for each in compared if each.source.body == "cam" and each.fits and each.as_it_is is each.match]
+    if not telling:
+        return
+    best = max(telling, key=lambda each: each.match.correlation)
+    written = best.fits["as is", "as is"]
+    if best.match.correlation < 0.6 or not _fits_better(best.match.correlation, written):
+        return
+    R_cam_imu_data = best.match.R_imu_body.inv()
+    angle = np.degrees((R_cam_imu * R_cam_imu_data.inv()).magnitude())
+    q = ", ".join(f"{value:.3f}" for value in R_cam_imu_data.as_quat(canonical=True))
+    evidence = {
+        "off_by_deg": float(angle),
+        "correlation_as_written": written,
+        "correlation_best_rotation": best.match.correlation,
+        "q_xyzw_of_data": q,
+        "against": best.source.file,
+    }
+    what = "the rotation of T_cam_imu does not fit the data, in neither direction"
+    fix = "calibrate it (Kalibr), or look for swapped axes of the IMU; the rotation that fits is in the evidence"
+    yield Finding("extrinsics-rotation", "error", "calibration.yaml", what, fix, evidence)
+
+
+def _offsets(log: Log, compared: list[_Compared]) -> Iterator[Finding]:
+    stated = log.calibration.timeshift_cam_imu_s if log.calibration else 0.0
+    late = []
+    for each in compared:
+        expected = stated if each.source.body == "cam" else 0.0
+        off = each.match.offset_s - expected
+        correlation = min(each.match.correlation, 1.0)
+        uncertain = _OFFSET_FLOOR_S + _OFFSET_NOISE_S * np.sqrt(1.0 - correlation**2) / correlation
+        late.append((each, off, off if abs(off) > uncertain else 0.0))
+    of_camera = [(each, off) for each, off, wrong in late if each.source.body == "cam" and wrong]
+    cameras = [each for each, _, _ in late if each.source.body == "cam"]
+    offsets = [each.match.offset_s for each, _ in of_camera]
+    agree = bool(offsets) and len(of_camera) == len(cameras) and float(np.ptp(offsets)) < 0.03
+    for each, off, wrong in late:
+        if not wrong:
+            continue
+        shared = agree and each.source.body == "cam"
+        best = max(of_camera, key=lambda pair: pair[0].match.correlation)[0] if shared else each
+        if shared and each is not best:
+            continue
+        yield _offset_finding(each, off, stated, shared and log.calibration is not None)
+
+
+def _offset_finding(each: _Compared, off: float, stated: float, shared: bool) -> Finding:
+    measured = each.match.offset_s
+    evidence = {
+        "measured_t_imu_minus_t_pose_s": round(measured, 4),
+        "expected_s": stated if each.source.body == "cam" else 0.0,
+        "correlation": each.match.correlation,
+        "correlation_far_away": each.match.background,
+    }
+    way = "late" if off < 0 else "early"
+    what = (
+        f"its stamps are {abs(off) * 1e3:.0f} ms {way}: what the gyroscope feels at t stands here at "
+        f"t {'+' if off < 0 else '-'} {abs(off) * 1e3:.0f} ms"
+    )
+    if shared:
+        fix = f"set timeshift_cam_imu: {measured:.4f} in calibration.yaml (t_imu = t_cam + timeshift_cam_imu)"
+        repair = _with_timeshift(measured)
+        return Finding("time-offset", "error", each.source.file, what, fix, evidence, repair)
+    fix = f"add {off:+.4f} s to its stamps (t_imu = t_cam + timeshift_cam_imu, and not every file is off)"
+    return Finding("time-offset", "error", each.source.file, what, fix, evidence)
+
+
+def _gyroscope_in_radians(log: Log) -> Log:
+    assert log.imu is not None
+    return replace(log, imu=replace(log.imu, angular_velocity=log.imu.angular_velocity / _DEGREES))
+
+
+def _inverse_extrinsics(log: Log) -> Log:
+    assert log.calibration is not None
+    assert log.calibration.T_cam_imu is not None
+    return replace(log, calibration=replace(log.calibration, T_cam_imu=log.calibration.T_cam_imu.inv()))
+
+
+def _with_timeshift(timeshift_s: float):  # type: ignore[no-untyped-def]
+    def repair(log: Log) -> Log:
+        calibration = log.calibration or Calibration()
+        return replace(log, calibration=replace(calibration, timeshift_cam_imu_s=round(timeshift_s, 4)))
+
+    return repair
+
+
+def _reread(file: str, reading: Reading):  # type: ignore[no-untyped-def]
+    def repair(log: Log) -> Log:
+        if file == "camera_poses.csv":
+            assert log.camera_poses is not None
+            T = reread(log.camera_poses.T_world_cam, reading)
+            return replace(log, camera_poses=replace(log.camera_poses, T_world_cam=T))
+        for name, poses in log.object_poses.items():
+            if object_poses_file(name) == file:
+                other = replace(poses, T_cam_obj=reread(poses.T_cam_obj, reading))
+                return replace(log, object_poses={**log.object_poses, name: other})
+        field = file.split(".")[0]
+        trajectory = getattr(log, field)
+        return replace(log, **{field: Trajectory(trajectory.stamps_ns, reread(trajectory.T_world_body, reading))})
+
+    return repair

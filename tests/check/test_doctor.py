@@ -1,0 +1,100 @@
+"""Known-bad logs are named, good ones pass silently, and what --fix writes is good."""
+
+from __future__ import annotations
+
+import json
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+sys.path.insert(0, str(Path(__file__).parent))
+
+from spoiled_logs import SPOILED_FILES, SPOILED_LOGS, imu, inverse_extrinsics, late_camera, write_spoiled
+
+from fusion.simulate import SimulationOptions, simulate
+from poet_loc.check.doctor import diagnose, write_repaired
+from poet_loc.cli.main import main
+from poet_loc.io.log_folder import read_log, write_log
+
+
+def names(findings) -> set[str]:
+    return {finding.check for finding in findings}
+
+
+@pytest.mark.parametrize("name", [*SPOILED_LOGS, *SPOILED_FILES])
+def test_a_known_bad_log_is_named_and_repaired(name, good_log, tmp_path) -> None:
+    folder = tmp_path / "log"
+    folder.mkdir()
+    expected, repairable = write_spoiled(name, good_log, folder)
+    diagnosis = diagnose(folder)
+    assert names(diagnosis.findings) == expected
+    assert all(finding.fix and finding.what for finding in diagnosis.findings)
+    json.dumps([finding.as_json() for finding in diagnosis.findings])
+    if repairable:
+        assert all(finding.repairable for finding in diagnosis.findings)
+        write_repaired(diagnosis, tmp_path / "fixed")
+        assert not diagnose(tmp_path / "fixed").findings
+        read_log(tmp_path / "fixed")
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        SimulationOptions(duration_s=8.0, seed=1),
+        SimulationOptions(duration_s=12.0, seed=2, noise="white"),
+        SimulationOptions(duration_s=8.0, seed=3, noise="none", imu_errors=False),
+        SimulationOptions(duration_s=12.0, seed=4, camera_poses=True, odometry=True, timeshift_cam_imu_s=0.05),
+    ],
+)
+def test_a_good_simulated_log_passes(options, tmp_path) -> None:
+    write_log(tmp_path, simulate(options))
+    assert not diagnose(tmp_path).findings
+
+
+@pytest.mark.parametrize("name", ["euroc_v101", "ycbv_dope/0029", "ycbv_dope/0051", "ycbv_dope/0059"])
+def test_a_good_shared_log_passes(name, shared_data) -> None:
+    assert not diagnose(shared_data / name).findings
+
+
+def test_several_faults_are_all_told_and_repaired(good_log, tmp_path) -> None:
+    (tmp_path / "log").mkdir()
+    spoiled = imu(180.0 / np.pi, 1.0 / 9.81)(inverse_extrinsics(late_camera(good_log)))
+    write_log(tmp_path / "log", spoiled)
+    diagnosis = diagnose(tmp_path / "log")
+    expected = {"gyroscope-degrees", "accelerometer-unit", "extrinsics-inverted", "time-offset"}
+    assert names(diagnosis.findings) == expected
+    write_repaired(diagnosis, tmp_path / "fixed")
+    assert not diagnose(tmp_path / "fixed").findings
+    fixed = read_log(tmp_path / "fixed")
+    np.testing.assert_allclose(fixed.imu.angular_velocity, good_log.imu.angular_velocity, rtol=1e-12)
+    np.testing.assert_allclose(fixed.calibration.T_cam_imu.as_matrix(), good_log.calibration.T_cam_imu.as_matrix())
+    assert fixed.calibration.timeshift_cam_imu_s == pytest.approx(-0.08, abs=0.005)
+
+
+def test_the_time_offset_has_kalibrs_sign(tmp_path) -> None:
+    """A camera whose stamps are late by the offset: t_imu = t_cam - offset."""
+    log = simulate(SimulationOptions(duration_s=10.0, seed=5, timeshift_cam_imu_s=0.06))
+    forgotten = replace(log, calibration=replace(log.calibration, timeshift_cam_imu_s=0.0))
+    write_log(tmp_path, forgotten)
+    (finding,) = diagnose(tmp_path).findings
+    assert finding.check == "time-offset"
+    assert finding.evidence["measured_t_imu_minus_t_pose_s"] == pytest.approx(0.06, abs=0.005)
+
+
+def test_the_command(good_log, tmp_path, capsys) -> None:
+    write_log(tmp_path, good_log)
+    assert main(["check", str(tmp_path)]) == 0
+    assert capsys.readouterr().out.strip() == "nothing found"
+    bad = tmp_path / "bad"
+    bad.mkdir()
+    write_log(bad, inverse_extrinsics(good_log))
+    assert main(["check", str(bad), "--json", "--fix", str(tmp_path / "fixed")]) == 1
+    (finding,) = json.loads(capsys.readouterr().out)
+    assert finding["check"] == "extrinsics-inverted"
+    assert finding["evidence"]["correlation_inverted"] > 0.9
+    assert main(["check", str(tmp_path / "fixed")]) == 0
+    assert main(["check", str(tmp_path / "nowhere")]) == 1
+    assert "does not exist" in capsys.readouterr().err
