@@ -10,8 +10,7 @@ from __future__ import annotations
 
 import math
 
-from numba import njit
-
+from fusion.compiled import njit
 from fusion.nav_state import Array, Ints
 from fusion.so3_kernels import apply, exp_so3, log_so3, multiply, multiply_transposed_left, multiply_transposed_right
 

@@ -10,8 +10,8 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
 
+from fusion.compiled import njit
 from fusion.imu import write_gravity_basis
 from fusion.nav_state import (
     AT_BIASES,
@@ -333,13 +333,10 @@ def decay_biases(x: Array, P: Array, seconds: float, bias_model: Array, layout: 
 
 @njit(cache=True)
 def _decay(x: Array, P: Array, n: int, b: int, at: int, first: int, kind: int, phi: float, bias_model: Array) -> None:
-    furthest = 0.0
-    for i in range(first, first + 3):
-        furthest = max(furthest, abs(x[b + i]) / bias_sigma(bias_model, kind, i))
-    fades = furthest <= bias_model[kind * BIAS_MODEL_SIZE + BIAS_JUMP_AT]
+    fading = fades(x, b, first, kind, bias_model)
     for i in range(first, first + 3):
         sigma = bias_sigma(bias_model, kind, i)
-        if fades:
+        if fading:
             x[b + i] *= phi
             for j in range(n):
                 P[at + i, j] *= phi
@@ -348,6 +345,15 @@ def _decay(x: Array, P: Array, n: int, b: int, at: int, first: int, kind: int, p
         else:
             sigma *= bias_model[kind * BIAS_MODEL_SIZE + BIAS_JUMP]
         P[at + i, at + i] += (1.0 - phi * phi) * sigma * sigma
+
+
+@njit(cache=True)
+def fades(x: Array, b: int, first: int, kind: int, bias_model: Array) -> bool:
+    """Tell whether half of the bias at x[b:] is no gross error, so that it relaxes."""
+    furthest = 0.0
+    for i in range(first, first + 3):
+        furthest = max(furthest, abs(x[b + i]) / bias_sigma(bias_model, kind, i))
+    return furthest <= bias_model[kind * BIAS_MODEL_SIZE + BIAS_JUMP_AT]
 
 
 @njit(cache=True)

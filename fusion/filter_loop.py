@@ -8,8 +8,8 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
 
+from fusion.compiled import njit
 from fusion.consensus import (
     LONGEST_WINDOW_S,
     LOST_MIN_VOTES,
@@ -84,6 +84,16 @@ from fusion.so3_kernels import (
     multiply_transposed_left,
     multiply_transposed_right,
 )
+from fusion.tape import (
+    note_correction,
+    note_decay,
+    note_forgetting,
+    note_meeting,
+    note_odometry,
+    note_restart,
+    note_row,
+    note_step,
+)
 
 # Places in the limits.
 LIMIT_BOTH, LIMIT_ROTATION, LIMIT_POSITION, PARTIAL, NOMINAL_OFFSET, ADAPTATION, MAX_SCALE, JUMP_AFTER = range(8)
@@ -136,6 +146,8 @@ def advance(m: Memory, w: Work, imu_stamps: Ints, imu_values: Array, until: int)
             propagate_nominal(m.x, dt, rate, force, w.step)
             transition_blocks(dt, w.step, w.blocks)
             propagate_covariance(m.P, w.blocks, dt, m.noise, w.basis, m.layout, w.core, w.rows)
+            if len(m.tape) > 0:
+                note_step(m, w, dt)
         else:
             propagate_nominal(m.x, dt, rate, force, w.step)
             _watch_gravity(m, w, dt)
@@ -152,6 +164,8 @@ def _advance_by_odometry(m: Memory, w: Work, dt: float, twist: Array) -> None:
     move_by_odometry(m.x, dt, twist[0:3], twist[3:6], w.step)
     if m.counters[MODE] == TRACKING:
         spread_by_odometry(m.P, R_before, dt, m.noise, m.layout, w.step)
+        if len(m.tape) > 0:
+            note_odometry(m, w)
 
 
 @njit(cache=True)
@@ -196,6 +210,8 @@ def measure(
     """Take in the measurements first..last-1, all at the filter's stamp; write decisions (M,) and nis (M, 3)."""
     c = m.counters
     if c[MODE] == TRACKING:
+        if len(m.tape) > 0:
+            note_decay(m, (c[NOW] - c[BIAS_TIME]) * 1e-9)
         decay_biases(m.x, m.P, (c[NOW] - c[BIAS_TIME]) * 1e-9, m.bias_model, m.layout)
         c[BIAS_TIME] = c[NOW]
     accepted = False
@@ -251,11 +267,11 @@ def _update(
     decision = gate(w.S, w.residual, m.limits, m.limits[PARTIAL], w.L, w.white, nis)
     if kind == OBJECT_POSE and m.limits[ADAPTATION] > 0.0:
         _adapt_scale(m, k, nis[0])
-    if decision == ACCEPTED:
-        correct(m.x, m.P, w.PHt, w.S, w.residual, 0, 6, m.layout, w.L, w.white, w.Z, w.error, w.scratch)
-    elif decision != REJECTED:
-        start = 3 if decision == POSITION_ONLY else 0
-        correct(m.x, m.P, w.PHt, w.S, w.residual, start, 3, m.layout, w.L, w.white, w.Z, w.error, w.scratch)
+    if decision != REJECTED:
+        first, size = 3 if decision == POSITION_ONLY else 0, 6 if decision == ACCEPTED else 3
+        correct(m.x, m.P, w.PHt, w.S, w.residual, first, size, m.layout, w.L, w.white, w.Z, w.error, w.scratch)
+        if len(m.tape) > 0:
+            note_correction(m, w, first, size, count)
     return decision
 
 
@@ -276,11 +292,15 @@ def _meet_object(m: Memory, w: Work, k: int, R_m: Array, t_m: Array, rate: Array
     if m.layout[N_BIAS_KINDS] > 0:
         for first in (0, 3):
             forget_bias(m.x, m.P, k, first, m.bias_model, m.layout)
+            if len(m.tape) > 0:
+                note_forgetting(m, k, first)
     count = residual_and_jacobian(
         OBJECT_POSE, k, R_m, t_m, m.x, rate, m.limits[NOMINAL_OFFSET], m.layout, w.residual, w.H, m.columns, w.step
     )
     adopt_object(m.x, m.P, w.H, m.columns, count, w.R, k, m.layout, w.objects)
     m.known[k] = 1.0
+    if len(m.tape) > 0:
+        note_meeting(m, w, k, count)
     return ACCEPTED
 
 
@@ -294,6 +314,8 @@ def _follow_jumps(m: Memory, kind: int, k: int, decision: int) -> None:
         m.refused[k, part] = 0.0 if used else m.refused[k, part] + 1.0
         if m.refused[k, part] >= m.limits[JUMP_AFTER]:
             forget_bias(m.x, m.P, k, 3 * part, m.bias_model, m.layout)
+            if len(m.tape) > 0:
+                note_forgetting(m, k, 3 * part)
             m.refused[k, part] = 0.0
 
 
@@ -432,6 +454,8 @@ def _restart_if_lost(m: Memory, w: Work) -> None:
 @njit(cache=True)
 def _adopt(m: Memory, w: Work, keep_from: int) -> None:
     """Move the state to the agreed pose; error states before keep_from (all where 0) and object biases start anew."""
+    if len(m.tape) > 0:
+        note_restart(m, keep_from)
     C, d, v, origin, turned = w.step[96:105], w.step[105:108], w.step[108:111], w.step[111:117], w.step[0:9]
     multiply(C, m.x[0:9], turned)
     for i in range(9):
@@ -472,9 +496,10 @@ def emit(m: Memory, row: int, out_stamps: Ints, out_core: Array, out_sigma: Arra
     for i in range(6):
         for j in range(6):
             out_covariance[row, 6 * i + j] = m.P[i, j]
+    if len(m.tape) > 0:
+        note_row(m, row)
 
 
-@njit(cache=True)
 def run_log(
     floats: Array,
     integers: Ints,
@@ -497,14 +522,43 @@ def run_log(
 
     A row for every IMU sample and every stamp with measurements, from the start on, each with what was known then.
     """
+    measured = (stamps, kinds, objects, rotations, translations, covariances, decisions, nis)
+    out = (out_stamps, out_core, out_sigma, out_covariance)
+    return int(run_part(floats, integers, imu_stamps, imu_values, *measured, *out, 0, len(imu_stamps), 0, 0)[1])
+
+
+@njit(cache=True)
+def run_part(
+    floats: Array,
+    integers: Ints,
+    imu_stamps: Ints,
+    imu_values: Array,
+    stamps: Ints,
+    kinds: Ints,
+    objects: Ints,
+    rotations: Array,
+    translations: Array,
+    covariances: Array,
+    decisions: Ints,
+    nis: Array,
+    out_stamps: Ints,
+    out_core: Array,
+    out_sigma: Array,
+    out_covariance: Array,
+    first: int,
+    end: int,
+    j: int,
+    rows: int,
+) -> tuple[int, int]:
+    """Filter IMU samples first..end-1 from measurement j and row `rows` on; return where both then stand."""
     m = views(floats, integers)
     w = work_views(m.work, m.layout[N_ERROR])
-    rate = np.zeros(3)
-    rows, j, total = 0, 0, len(stamps)
-    while j < total and stamps[j] < imu_stamps[0]:
-        j += 1
-    begin(m, imu_stamps[0], imu_values[0, 3:6], 0)
-    for k in range(len(imu_stamps)):
+    rate, total = np.zeros(3), len(stamps)
+    if first == 0:
+        while j < total and stamps[j] < imu_stamps[0]:
+            j += 1
+        begin(m, imu_stamps[0], imu_values[0, 3:6], 0)
+    for k in range(first, end):
         emitted = False
         while j < total and stamps[j] <= imu_stamps[k]:
             last = j
@@ -522,4 +576,4 @@ def run_log(
         if m.counters[MODE] == TRACKING and not emitted:
             emit(m, rows, out_stamps, out_core, out_sigma, out_covariance)
             rows += 1
-    return rows
+    return j, rows

@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,6 +23,26 @@ from poet_loc.core.records import CameraPoses, ObjectPoses
 from poet_loc.io.log_folder import Log
 
 Array = NDArray[np.float64]
+Stamps = NDArray[np.int64]
+
+
+class LoopColumns(NamedTuple):
+    """What a loop over a whole log reads and writes, in the order of its arguments."""
+
+    imu_stamps: Stamps
+    imu_values: Array
+    stamps: Stamps
+    kinds: Stamps
+    objects: Stamps
+    rotations: Array
+    translations: Array
+    covariances: Array
+    decisions: Stamps
+    nis: Array
+    out_stamps: Stamps
+    out_core: Array
+    out_sigma: Array
+    out_covariance: Array
 
 
 def fuse(
@@ -38,7 +59,13 @@ def fuse(
     options = options or FuseOptions()
     problem = pose_problem(log, options, camera_poses, object_poses)
     if options.estimator == "eskf":
+        if options.smooth:
+            from fusion.smoother import run_smoother  # which is built on this module
+
+            return run_smoother(problem, options)
         return run_filter(problem, options)
+    if options.smooth:
+        raise InputError(f"smoothing goes with the eskf, not with {options.estimator}", fix="leave --smooth out")
     from fusion.graph import run_graph  # gtsam takes a second to import
 
     return run_graph(problem, options)
@@ -53,42 +80,56 @@ def run_filter(
     """
     began = time.perf_counter()
     floats, integers = fill_memory(problem, options)
-    measured, imu = problem.measurements, problem.imu
-    count, rows = len(measured), len(imu) + len(measured)
-    decisions, nis = np.zeros(count, dtype=np.int64), np.full((count, 3), np.nan)
-    stamps, core = np.zeros(rows, dtype=np.int64), np.zeros((rows, filter_loop.OUT_CORE))
-    sigma, covariance = np.zeros((rows, filter_loop.OUT_SIGMA)), np.zeros((rows, filter_loop.OUT_COVARIANCE))
-    columns = (measured.kinds, measured.objects, measured.rotations, measured.translations, measured.covariances)
-    written = loop(
-        floats,
-        integers,
-        imu.stamps_ns,
-        np.hstack([imu.angular_velocity, imu.specific_force]),
-        measured.stamps_ns,
-        *columns,
-        decisions,
-        nis,
-        stamps,
-        core,
-        sigma,
-        covariance,
-    )
+    columns = loop_columns(problem)
+    written = loop(floats, integers, *columns)
     if written == 0:
-        raise InputError(
-            f"the filter never started: no {options.start.min_votes} poses within "
-            f"{options.start.window_s} s agree with each other and with gravity",
-            path=problem.path,
-            fix="check the map and the extrinsics, or relax --start",
-        )
+        raise never_started(problem, options)
     counters = memory.views.py_func(floats, integers).counters
     result = result_from_rows(
         f"fuse/{estimator}/{options.measurements}",
-        (stamps[:written], core[:written], sigma[:written], covariance[:written].reshape(-1, 6, 6)),
-        gate_log(problem, decisions, nis),
+        (
+            columns.out_stamps[:written],
+            columns.out_core[:written],
+            columns.out_sigma[:written],
+            columns.out_covariance[:written].reshape(-1, 6, 6),
+        ),
+        gate_log(problem, columns.decisions, columns.nis),
         time.perf_counter() - began,
         int(counters[memory.RESTARTS]),
     )
     return replace(result, motion=problem.motion, body=problem.body)
+
+
+def loop_columns(problem: Problem) -> LoopColumns:
+    """Return what a loop over the problem's whole log reads and has room to write."""
+    measured, imu = problem.measurements, problem.imu
+    count, rows = len(measured), len(imu) + len(measured)
+    return LoopColumns(
+        imu.stamps_ns,
+        np.hstack([imu.angular_velocity, imu.specific_force]),
+        measured.stamps_ns,
+        measured.kinds,
+        measured.objects,
+        measured.rotations,
+        measured.translations,
+        measured.covariances,
+        np.zeros(count, dtype=np.int64),
+        np.full((count, 3), np.nan),
+        np.zeros(rows, dtype=np.int64),
+        np.zeros((rows, filter_loop.OUT_CORE)),
+        np.zeros((rows, filter_loop.OUT_SIGMA)),
+        np.zeros((rows, filter_loop.OUT_COVARIANCE)),
+    )
+
+
+def never_started(problem: Problem, options: FuseOptions) -> InputError:
+    """Return the error of a filter whose start's conditions were never met."""
+    return InputError(
+        f"the filter never started: no {options.start.min_votes} poses within "
+        f"{options.start.window_s} s agree with each other and with gravity",
+        path=problem.path,
+        fix="check the map and the extrinsics, or relax --start",
+    )
 
 
 def result_from_rows(

@@ -6,8 +6,8 @@ Nothing here knows gtsam.
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
+from fusion.compiled import njit
 from fusion.eskf import fit_symmetry
 from fusion.filter_loop import advance, angular_velocity_at, begin, emit, measure
 from fusion.imu import propagate_nominal

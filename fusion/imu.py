@@ -10,8 +10,8 @@ with the midpoint attitude in place of the start's and the bias terms kept to se
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
+from fusion.compiled import njit
 from fusion.nav_state import (
     ACCEL_BIAS,
     ACCEL_BIAS_ERROR,

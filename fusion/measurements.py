@@ -21,9 +21,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from fusion.compiled import njit
 from fusion.nav_state import (
     AT_BIASES,
     AT_EXTRINSICS,

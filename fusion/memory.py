@@ -6,9 +6,9 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from fusion.compiled import njit
 from fusion.consensus import VOTE_SIZE
 from fusion.measurements import MAX_COLUMNS
 from fusion.nav_state import CORE, StateLayout
@@ -19,7 +19,7 @@ Ints = NDArray[np.int64]
 VOTES = 256  # a second of eight objects at 30 Hz
 
 # Counters, part of what a snapshot keeps.
-NOW, IMU_AT, MODE, BIAS_TIME, STARTED_AT, VOTE_HEAD, RESTARTS, LAST_UPDATE, UP_COUNT, N_COUNTERS = range(10)
+NOW, IMU_AT, MODE, BIAS_TIME, STARTED_AT, VOTE_HEAD, RESTARTS, LAST_UPDATE, UP_COUNT, TAPE_END, N_COUNTERS = range(11)
 INITIALISING, TRACKING = 0, 1
 
 # Integer header: where things stand in the float buffer, sizes.
@@ -48,8 +48,10 @@ INITIALISING, TRACKING = 0, 1
     AT_COLUMNS,
     AT_VOTE_STAMPS,
     AT_INLIERS,
+    AT_TAPE,
+    TAPE_SIZE,
     HEADER,
-) = range(25)
+) = range(27)
 
 
 class Memory(NamedTuple):
@@ -69,6 +71,7 @@ class Memory(NamedTuple):
     prior: Array  # (n,) 1-sigma of the error state at the start
     work: Array
     votes: Array
+    tape: Array  # what the smoother needs of it (`fusion/tape.py`); empty where nobody asks
     layout: Ints
     counters: Ints
     orders: Ints  # (K,) symmetry order, 1 none, 0 continuous
@@ -169,6 +172,7 @@ def views(floats: Array, integers: Ints) -> Memory:
         f[i[AT_PRIOR] : i[AT_PRIOR] + n],
         f[i[AT_WORK] : i[AT_WORK] + work_size(n)],
         f[i[AT_VOTES] : i[AT_VOTES] + VOTES * VOTE_SIZE].reshape((VOTES, VOTE_SIZE)),
+        f[i[AT_TAPE] : i[AT_TAPE] + i[TAPE_SIZE]],
         i[i[AT_LAYOUT] : i[AT_LAYOUT] + 10],
         i[i[AT_COUNTERS] : i[AT_COUNTERS] + N_COUNTERS],
         i[i[AT_ORDERS] : i[AT_ORDERS] + K],

@@ -7,9 +7,9 @@ the exponential of that part: R <- R Exp(w dt), p <- p + R J_l(w dt) v dt. Its e
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 from scipy.spatial.transform import RigidTransform
 
+from fusion.compiled import njit
 from fusion.nav_state import N_ERROR, POSITION, POSITION_ERROR, VELOCITY, Array, Ints
 from fusion.so3_kernels import apply, exp_so3, left_jacobian, multiply, orthonormalise, times_skew
 from poet_loc.core.geometry import local

@@ -218,6 +218,8 @@ class FuseOptions:
 
     estimator: Literal["eskf", "graph", "batch"] = "eskf"
     """eskf: error-state Kalman filter; graph: fixed-lag smoother; batch: the whole log at once."""
+    smooth: bool = False
+    """eskf: let every state know the whole log; not causal, and named fuse/eskf-smoothed."""
     measurements: Literal["camera", "objects"] = "objects"
     """camera: the solver's (or the log's own) camera poses; objects: each object's pose directly."""
     motion: Literal["auto", "imu", "odometry", "constant-velocity"] = "auto"

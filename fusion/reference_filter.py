@@ -111,7 +111,7 @@ class ReferenceFilter:
             filter_loop._watch_gravity(m, self.work, dt)
             return
         m.x[:], F = transition(m.x, dt, values[:3], values[3:], self.layout)
-        _, m.P[:] = predict(self.zero, m.P, F, process_noise(self.layout.n_error, dt, m.noise))
+        self.spread(F, process_noise(self.layout.n_error, dt, m.noise))
 
     def _step_by_odometry(self, dt: float, twist: Array) -> None:
         m = self.m
@@ -120,7 +120,16 @@ class ReferenceFilter:
             Q = np.zeros_like(F)
             Q[ATT, ATT] = m.noise[odometry.ROTATION_WALK] ** 2 * dt * np.eye(3)
             Q[POS, POS] = m.noise[odometry.TRANSLATION_WALK] ** 2 * dt * np.eye(3)
-            _, m.P[:] = predict(self.zero, m.P, F, Q)
+            self.spread(F, Q)
+
+    def spread(self, A: Array, Q: Array) -> None:
+        """Map the error by A and add noise: P <- A P A^T + Q."""
+        _, self.m.P[:] = predict(self.zero, self.m.P, A, Q)
+
+    def condition(self, residual: Array, H: Array, R: Array) -> Array:
+        """Condition the error on a residual; return its mean, which the nominal state has yet to take over."""
+        error, self.m.P[:] = update(self.zero, self.m.P, residual, R, H)
+        return np.asarray(error)
 
     def decay_biases(self) -> None:
         """Let the object biases relax since the last measurement: Gauss-Markov, x <- phi x, P <- Phi P Phi + Q.
@@ -147,7 +156,7 @@ class ReferenceFilter:
                     else:
                         sigma = sigma * model[BIAS_JUMP]
                     Q[rows, rows] = np.diag((1.0 - phi**2) * sigma**2)
-        _, m.P[:] = predict(self.zero, m.P, Phi, Q)
+        self.spread(Phi, Q)
 
     def gate(self, residual: Array, S: Array, nis: Array) -> int:
         """Decide what of a measurement to use; write its NIS [both, rotation, position] into nis (3,)."""
@@ -186,15 +195,14 @@ class ReferenceFilter:
     def correct(self, residual: Array, H: Array, R: Array) -> None:
         """Update the error state from zero, move the nominal state by it, and carry the covariance along."""
         m, before = self.m, self.m.x.copy()
-        error, P = update(self.zero, m.P, residual, R, H)
+        error = self.condition(residual, H, R)
         m.x[:] = retract_state(before, error, self.layout)
-        G = transport(before, m.x, error, self.layout)
-        m.P[:] = G @ P @ G.T
+        self.spread(transport(before, m.x, error, self.layout), np.zeros_like(m.P))
 
     def _meet_object(self, k: int, R_m: Array, t_m: Array, R: Array, rate: Array) -> int:
         """Place an object whose pose in the world is unknown where its first detection sees it.
 
-        With 0 = H_x dx + H_o do + e its error is do = G dx - H_o^-1 e with G = -H_o^-1 H_x.
+        With 0 = H_x dx + H_o do + e its error is do = -H_o^-1 (H_x dx + e).
         """
         m, layout, x = self.m, self.layout, self.m.x
         if not layout.objects:
@@ -211,10 +219,9 @@ class ReferenceFilter:
         rows = layout.error_slice("objects", k)
         inverse = np.linalg.inv(H[:, rows])
         H[:, rows] = 0.0
-        P = m.P.copy()
-        m.P[rows] = -inverse @ H @ P
-        m.P[:, rows] = m.P[rows].T
-        m.P[rows, rows] = inverse @ (H @ P @ H.T + R) @ inverse.T
+        A, Q = np.eye(layout.n_error), np.zeros_like(m.P)
+        A[rows], Q[rows, rows] = -inverse @ H, inverse @ R @ inverse.T
+        self.spread(A, Q)
         m.known[k] = 1.0
         return ACCEPTED
 

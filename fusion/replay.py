@@ -10,8 +10,7 @@ from __future__ import annotations
 
 import math
 
-from numba import njit
-
+from fusion.compiled import njit
 from fusion.consensus import VOTE_USED
 from fusion.filter_loop import advance, angular_velocity_at, begin, measure
 from fusion.memory import IMU_AT, N_COUNTERS, NOW, VOTE_HEAD, VOTES, Memory, Work, views, work_views

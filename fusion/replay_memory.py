@@ -5,8 +5,8 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 
+from fusion.compiled import njit
 from fusion.consensus import VOTE_SIZE
 from fusion.memory import END_OF_STATE, N_COUNTERS, VOTES
 from fusion.nav_state import Array, Ints

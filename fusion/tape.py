@@ -1,0 +1,200 @@
+"""What the filter did to its error, written down for the smoother to go back over: one record per linear map.
+
+A memory without a tape (the filter's own runs) writes nothing. Records are read from the end, so each ends with its
+length and its kind; numbers of any type are stored as floats.
+
+    STEP        dt, the core's transition blocks (45), gravity's basis (6)
+    ODOMETRY    Exp(w dt) (9), R skew(step) (9)
+    DECAY       the factor of every object bias
+    CORRECTION  parts, G (9), skew blocks (9 each); rows, columns, their numbers, L^-1 H, L^-1 residual, Z = L^-1 H P
+    MEETING     the object's first error state, columns, their numbers, the derivative of its pose by them (6 rows)
+    FORGETTING  first error state, how many
+    RESTART     which error states (n) survive
+    ROW         number, x (core), the core's rows of P
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from fusion.compiled import njit
+from fusion.eskf import BIAS_MODEL_SIZE, BIAS_TAU, fades
+from fusion.measurements import MAX_COLUMNS
+from fusion.memory import AT_TAPE, TAPE_END, TAPE_SIZE, Memory, Work
+from fusion.nav_state import (
+    AT_BIASES,
+    AT_OBJECTS,
+    BIASES,
+    CORE,
+    EXTRINSIC_ROTATION,
+    N_BIAS_KINDS,
+    N_ERROR,
+    N_OBJECTS,
+    POSITION,
+    Array,
+    Ints,
+)
+from fusion.so3_kernels import multiply_transposed_left
+
+STEP, ODOMETRY, DECAY, CORRECTION, MEETING, FORGETTING, RESTART, ROW = range(8)
+STEP_SIZE, TAIL = 54, 2
+
+
+def with_tape(floats: Array, integers: Ints, size: int) -> tuple[Array, Ints]:
+    """Return copies of a filter's buffers that have room for so many floats of tape."""
+    integers = integers.copy()
+    integers[AT_TAPE], integers[TAPE_SIZE] = len(floats), size
+    return np.concatenate([floats, np.zeros(size)]), integers
+
+
+def tape_bound(layout: Ints, samples: int, stamps: int, measurements: int) -> int:
+    """Return how many floats so many IMU samples, stamps with measurements and measurements write at most."""
+    n, K = int(layout[N_ERROR]), int(layout[N_OBJECTS])
+    biases = 6 * K * int(layout[N_BIAS_KINDS])
+    steps, row = (samples + stamps) * (STEP_SIZE + TAIL), 1 + CORE + 6 + CORE * n + TAIL
+    correction = 1 + 9 * (3 + K) + 2 + MAX_COLUMNS + 6 * MAX_COLUMNS + 6 + 6 * n + TAIL
+    meeting_and_forgetting = 2 + MAX_COLUMNS + 6 * MAX_COLUMNS + TAIL + 4 * (2 + TAIL)
+    per_stamp = biases + TAIL + n + TAIL
+    return steps + (samples + stamps) * row + stamps * per_stamp + measurements * (correction + meeting_and_forgetting)
+
+
+@njit(cache=True, inline="always")
+def _close(m: Memory, end: int, kind: int) -> None:
+    """End a record whose numbers reach to `end`."""
+    m.tape[end] = end - m.counters[TAPE_END]
+    m.tape[end + 1] = kind
+    m.counters[TAPE_END] = end + TAIL
+
+
+@njit(cache=True)
+def note_step(m: Memory, w: Work, dt: float) -> None:
+    """Write down a step of the IMU."""
+    at = m.counters[TAPE_END]
+    m.tape[at] = dt
+    for i in range(45):
+        m.tape[at + 1 + i] = w.blocks[i]
+    for i in range(6):
+        m.tape[at + 46 + i] = w.basis[i]
+    _close(m, at + 52, STEP)
+
+
+@njit(cache=True)
+def note_odometry(m: Memory, w: Work) -> None:
+    """Write down a step of the odometry, from what `odometry.spread_by_odometry` left."""
+    at = m.counters[TAPE_END]
+    for i in range(9):
+        m.tape[at + i] = w.step[i]
+        m.tape[at + 9 + i] = w.step[36 + i]
+    _close(m, at + 18, ODOMETRY)
+
+
+@njit(cache=True)
+def note_decay(m: Memory, seconds: float) -> None:
+    """Write down what `eskf.decay_biases` is about to do."""
+    at, K = m.counters[TAPE_END], m.layout[N_OBJECTS]
+    for kind in range(m.layout[N_BIAS_KINDS]):
+        phi = math.exp(-seconds / m.bias_model[kind * BIAS_MODEL_SIZE + BIAS_TAU])
+        for k in range(K):
+            shift = 6 * (k + kind * K)
+            for first in (0, 3):
+                fading = fades(m.x, m.layout[BIASES] + shift, first, kind, m.bias_model)
+                for i in range(first, first + 3):
+                    m.tape[at + shift + i] = phi if fading else 1.0
+    _close(m, at + 6 * K * m.layout[N_BIAS_KINDS], DECAY)
+
+
+@njit(cache=True)
+def note_correction(m: Memory, w: Work, first: int, size: int, count: int) -> None:
+    """Write down a correction with rows first..first+size, from what `eskf.correct` left."""
+    tape, n, before = m.tape, m.layout[N_ERROR], w.scratch[32:47]
+    at = m.counters[TAPE_END]
+    parts = 2 + (m.layout[N_OBJECTS] if m.layout[AT_OBJECTS] >= 0 else 0)
+    tape[at] = parts
+    multiply_transposed_left(m.x, before, tape[at + 1 : at + 10])
+    at += 10
+    for part in range(parts):
+        if part < 2:
+            p = POSITION + 3 * part
+            dx, dy, dz = before[p] - m.x[p], before[p + 1] - m.x[p + 1], before[p + 2] - m.x[p + 2]
+        else:
+            row = m.layout[AT_OBJECTS] + 6 * (part - 2) + 3
+            dx, dy, dz = -w.error[row], -w.error[row + 1], -w.error[row + 2]
+        for j in range(3):
+            tape[at + j] = dy * before[6 + j] - dz * before[3 + j]
+            tape[at + 3 + j] = dz * before[j] - dx * before[6 + j]
+            tape[at + 6 + j] = dx * before[3 + j] - dy * before[j]
+        at += 9
+    tape[at], tape[at + 1] = size, count
+    at += 2
+    for c in range(count):
+        tape[at + c] = m.columns[c]
+    at += count
+    for r in range(size):  # L^-1 H
+        for c in range(count):
+            total = w.H[first + r, c]
+            for q in range(r):
+                total -= w.L[r, q] * tape[at + q * count + c]
+            tape[at + r * count + c] = total / w.L[r, r]
+    at += size * count
+    for r in range(size):
+        tape[at + r] = w.white[r]
+        for j in range(n):
+            tape[at + size + r * n + j] = w.Z[r, j]
+    _close(m, at + size + size * n, CORRECTION)
+
+
+@njit(cache=True)
+def note_meeting(m: Memory, w: Work, k: int, count: int) -> None:
+    """Write down that object k was placed where its first detection saw it (`eskf.adopt_object`)."""
+    tape, at, own = m.tape, m.counters[TAPE_END], m.layout[AT_OBJECTS] + 6 * k
+    tape[at], tape[at + 1] = own, count
+    at += 2
+    first = 0
+    while m.columns[first] != own:
+        first += 1
+    for c in range(count):
+        tape[at + c] = m.columns[c]
+    at += count
+    for r in range(6):
+        half = 3 * (r // 3)
+        for c in range(count):
+            total = 0.0
+            for s in range(3):
+                total += w.H[half + s, first + r] * w.H[half + s, c]
+            tape[at + r * count + c] = 0.0 if first <= c < first + 6 else -total
+    _close(m, at + 6 * count, MEETING)
+
+
+@njit(cache=True)
+def note_forgetting(m: Memory, k: int, first: int) -> None:
+    """Write down that half of an object's varying bias was forgotten."""
+    at = m.counters[TAPE_END]
+    m.tape[at], m.tape[at + 1] = m.layout[AT_BIASES] + 6 * k + first, 3
+    _close(m, at + 2, FORGETTING)
+
+
+@njit(cache=True)
+def note_restart(m: Memory, keep_from: int) -> None:
+    """Write down which error states survive a restart (`filter_loop._adopt`)."""
+    at, n = m.counters[TAPE_END], m.layout[N_ERROR]
+    first, biases = m.layout[AT_BIASES], 6 * m.layout[N_OBJECTS] * m.layout[N_BIAS_KINDS]
+    for i in range(n):
+        is_bias = first >= 0 and first <= i < first + biases
+        m.tape[at + i] = 1.0 if i >= keep_from and keep_from > 0 and not is_bias else 0.0
+    _close(m, at + n, RESTART)
+
+
+@njit(cache=True)
+def note_row(m: Memory, row: int) -> None:
+    """Write down the state that a row of the output shows."""
+    tape, n, at = m.tape, m.layout[N_ERROR], m.counters[TAPE_END]
+    tape[at] = row
+    for i in range(EXTRINSIC_ROTATION):
+        tape[at + 1 + i] = m.x[i]
+    at += 1 + EXTRINSIC_ROTATION
+    for i in range(CORE):
+        for j in range(n):
+            tape[at + i * n + j] = m.P[i, j]
+    _close(m, at + CORE * n, ROW)
