@@ -198,6 +198,7 @@ def log_from_pixels(options: VideoOptions, number: int = 0, detection: DetectOpt
     from poet_loc.detect.outputs import object_poses
     from poet_loc.detect.stage import sightings
     from poet_loc.io.frames_csv import read_frames
+    from poet_loc.io.landmarks_json import read_landmarks
     from poet_loc.io.log_folder import read_log
     from poet_loc.io.object_poses_csv import write_object_poses
 
@@ -214,5 +215,7 @@ def log_from_pixels(options: VideoOptions, number: int = 0, detection: DetectOpt
 
     count = len(read_frames(folder / "frames.csv"))
     show_progress(collect(), count, 0, "frames", options.progress, "detecting")
-    write_object_poses(folder / "object_poses.csv", object_poses(found))
+    poses = object_poses(found)
+    on_map = np.isin(poses.object_ids, read_landmarks(folder / "landmarks.json").object_ids)
+    write_object_poses(folder / "object_poses.csv", poses[on_map])  # a log has no objects beyond its map
     return read_log(folder)

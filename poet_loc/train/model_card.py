@@ -34,7 +34,7 @@ class MeasureOptions:
     weights: Path = EMBEDDED_WEIGHTS
     """Checkpoint (safetensors); without it the embedded one."""
     write_poses: bool = True
-    """Write object_poses_bb.csv and object_poses_gt.csv into the videos' folders."""
+    """Write object_poses_bb.csv and object_poses_gt.csv into the videos' folders, objects of the map alone."""
     least_visible: float = 0.1
     """Objects less visible than this share are not asked for."""
 
@@ -71,6 +71,7 @@ class Figures:
 def measure(options: MeasureOptions) -> Figures:
     """Run a checkpoint over all videos and compare with the truth."""
     from poet_loc.data.world.objects import household_objects
+    from poet_loc.io.landmarks_json import read_landmarks
     from poet_loc.io.object_poses_csv import write_object_poses
 
     folders = sorted(path.parent for path in options.videos.glob("*/frames.csv"))
@@ -88,7 +89,8 @@ def measure(options: MeasureOptions) -> Figures:
         for kind, poses in found.poses.items():
             parts[kind].append(score_poses(poses, scene, models, options.least_visible))
             if options.write_poses:
-                write_object_poses(folder / f"object_poses_{kind}.csv", poses)
+                on_map = np.isin(poses.object_ids, read_landmarks(folder / "landmarks.json").object_ids)
+                write_object_poses(folder / f"object_poses_{kind}.csv", poses[on_map])
         detections += found.detections
         truth += [_boxes_with_class(scene, row, options.least_visible) for row in range(len(frames))]
     coco = tuple(np.arange(0.5, 1.0, 0.05))
@@ -200,7 +202,7 @@ def _percents(values: Array) -> str:
     return " ".join(f"{value:.0f} %" for value in values)
 
 
-def full_card(options: MeasureOptions, log: Path) -> str:
+def full_card(options: MeasureOptions, figures: Figures, log: Path) -> str:
     """Return the whole model card as Markdown: what the checkpoint is, its figures, its curve from log.jsonl."""
     _, config = load_model(options.weights, with_detector=False)
     source = config.source
@@ -227,7 +229,7 @@ def full_card(options: MeasureOptions, log: Path) -> str:
         f"`poet-loc model-card --videos FOLDER`; objects at least {100 * options.least_visible:.0f} % visible, "
         "missed ones count as infinitely wrong.",
         "",
-        card_table(measure(options)),
+        card_table(figures),
         "",
         "## Curve",
         "Running means of the losses (pose losses summed over the decoder's layers) by optimiser step.",
