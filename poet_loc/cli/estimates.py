@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, fields, replace
 from typing import Literal
-
-import numpy as np
 
 from fusion.options import FuseOptions
 from fusion.result import FuseResult
@@ -14,18 +12,9 @@ from landmarks.localize import LocalizeOptions, LocalizeResult, localize
 from landmarks.options import MODES, ORACLES, Mode, SolverOptions
 from poet_loc.cli.terminal import Report
 from poet_loc.core.input_error import InputError
-from poet_loc.core.records import CameraPoses, ObjectPoses, Stamps
-from poet_loc.core.trajectory import Trajectory
 from poet_loc.io.log_folder import Log
-from poet_loc.report.evaluate import (
-    Body,
-    Estimate,
-    EvaluateOptions,
-    Evaluation,
-    evaluate,
-    frames_to_compare,
-    references_for_both_bodies,
-)
+from poet_loc.report.evaluate import Estimate, EvaluateOptions, Evaluation
+from poet_loc.report.log_evaluation import evaluate_log, references_of
 from poet_loc.report.run_record import RunRecord
 
 Fusion = tuple[Literal["eskf", "graph", "batch"], Literal["camera", "objects"]]
@@ -63,7 +52,7 @@ class Estimates:
         calibration = self.log.calibration
         return RunRecord(
             estimates=_estimates(self.log, self.localized, self.fused),
-            references=_references(self.log),
+            references=references_of(self.log),
             evaluation=self.evaluation,
             fused=self.fused,
             landmark_map=self.log.landmark_map,
@@ -118,19 +107,14 @@ def evaluate_estimates(
 ) -> Evaluation | None:
     """Return the errors of the estimates; None, with a note, where the log has no ground truth for any of them."""
     report.step("evaluate")
-    references = _references(log)
-    known = [estimate for estimate in estimates if estimate.body in references]
-    if not known:
+    evaluation = evaluate_log(log, detections, estimates, options)
+    if evaluation is None:
         report.note(f"{log.path}: no ground truth of the camera or the IMU: no errors")
         return None
-    missing = {estimate.body for estimate in estimates} - references.keys()
+    missing = {estimate.body for estimate in estimates} - references_of(log).keys()
     if missing:
         report.note(f"{log.path}: no T_world_{missing.pop()}.tum and no extrinsics: no errors of what follows it")
-    sensor_ns = _sensor_stamps(log, detections)
-    truth_ns = references["cam" if "cam" in references else "imu"].stamps_ns
-    frames_ns = frames_to_compare(truth_ns, sensor_ns) if log.frames is None else log.frames.stamps_ns
-    span_ns = (int(sensor_ns.min()), int(sensor_ns.max()))
-    return evaluate(known, references, span_ns, options, frames_ns)
+    return evaluation
 
 
 class _Attempt:
@@ -206,18 +190,3 @@ def _estimates(log: Log, localized: Sequence[LocalizeResult], fused: Sequence[Fu
         for result in localized
     ]
     return (*given, *solved, *(replace(Estimate.of_fused(result), body=result.body) for result in fused))
-
-
-def _references(log: Log) -> Mapping[Body, Trajectory]:
-    there: dict[Body, Trajectory] = {}
-    if log.T_world_cam is not None:
-        there["cam"] = log.T_world_cam
-    if log.T_world_imu is not None:
-        there["imu"] = log.T_world_imu
-    return references_for_both_bodies(there, None if log.calibration is None else log.calibration.T_cam_imu)
-
-
-def _sensor_stamps(log: Log, detections: str | None) -> Stamps:
-    source: ObjectPoses | CameraPoses | None = log.camera_poses if detections is None else log.object_poses[detections]
-    assert source is not None
-    return np.asarray(source.stamps_ns)

@@ -1,0 +1,48 @@
+"""Estimates of a log against the log's own ground truth."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from poet_loc.core.trajectory import Trajectory
+from poet_loc.io.log_folder import Log
+from poet_loc.report.evaluate import (
+    Body,
+    Estimate,
+    EvaluateOptions,
+    Evaluation,
+    evaluate,
+    frames_to_compare,
+    references_for_both_bodies,
+)
+
+
+def references_of(log: Log) -> dict[Body, Trajectory]:
+    """Return the ground truth of camera and IMU that a log has, the missing one by way of T_cam_imu."""
+    there: dict[Body, Trajectory] = {}
+    if log.T_world_cam is not None:
+        there["cam"] = log.T_world_cam
+    if log.T_world_imu is not None:
+        there["imu"] = log.T_world_imu
+    return references_for_both_bodies(there, None if log.calibration is None else log.calibration.T_cam_imu)
+
+
+def evaluate_log(
+    log: Log, detections: str | None, estimates: Sequence[Estimate], options: EvaluateOptions
+) -> Evaluation | None:
+    """Return the errors of those estimates whose body the log has ground truth for; None where it has for none.
+
+    detections names the set whose stamps are the sensor's; None: the log's camera poses.
+    """
+    references = references_of(log)
+    known = [estimate for estimate in estimates if estimate.body in references]
+    if not known:
+        return None
+    source = log.camera_poses if detections is None else log.object_poses[detections]
+    assert source is not None
+    sensor_ns = np.asarray(source.stamps_ns)
+    truth_ns = references["cam" if "cam" in references else "imu"].stamps_ns
+    frames_ns = frames_to_compare(truth_ns, sensor_ns) if log.frames is None else log.frames.stamps_ns
+    return evaluate(known, references, (int(sensor_ns.min()), int(sensor_ns.max())), options, frames_ns)
