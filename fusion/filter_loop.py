@@ -145,7 +145,7 @@ def advance(m: Memory, w: Work, imu_stamps: Ints, imu_values: Array, until: int)
                 write_gravity_basis(m.x, w.basis)
             propagate_nominal(m.x, dt, rate, force, w.step)
             transition_blocks(dt, w.step, w.blocks)
-            propagate_covariance(m.P, w.blocks, dt, m.noise, w.basis, m.layout, w.core, w.rows)
+            propagate_covariance(m.P, w.blocks, dt, (end - start) * 1e-9, m.noise, w.basis, m.layout, w.core, w.rows)
             if len(m.tape) > 0:
                 note_step(m, w, dt)
         else:

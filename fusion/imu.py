@@ -120,7 +120,15 @@ def _rows_times(
 
 @njit(cache=True)
 def propagate_covariance(
-    P: Array, blocks: Array, dt: float, noise: Array, gravity_basis: Array, layout: Ints, core: Array, scratch: Array
+    P: Array,
+    blocks: Array,
+    dt: float,
+    interval: float,
+    noise: Array,
+    gravity_basis: Array,
+    layout: Ints,
+    core: Array,
+    scratch: Array,
 ) -> None:
     """P <- F P F^T + Q, in place, touching the core block and its cross terms only.
 
@@ -145,31 +153,27 @@ def propagate_covariance(
             P[i, j] = P[j, i] = 0.5 * (core[i, j] + core[j, i])
         for j in range(CORE, n):
             P[j, i] = P[i, j]
-    add_process_noise(P, dt, noise)
+    add_process_noise(P, dt, interval, noise)
 
 
 @njit(cache=True)
-def add_process_noise(P: Array, dt: float, noise: Array) -> None:
+def add_process_noise(P: Array, dt: float, interval: float, noise: Array) -> None:
     """Add what white noise and random walks do in dt seconds (S eq. 261, position integrated exactly).
 
-    An interval longer than noise[GAP_S] is a gap: angular rate and acceleration may have been anything of the given
-    size all through it, so their effects grow with dt and dt^2 instead of sqrt(dt).
+    interval is the time (s) between the two samples that dt is a part of. One longer than noise[GAP_S] is a gap:
+    angular rate and acceleration may have been anything of the given size all through it, so that their sigma grows
+    with the interval and not with its root.
     """
     gyro, accel = noise[GYRO_NOISE] ** 2, noise[ACCEL_NOISE] ** 2
-    attitude, velocity = gyro * dt, accel * dt
-    cross, position = 0.5 * accel * dt * dt, accel * dt**3 / 3.0
-    if dt > noise[GAP_S]:
-        attitude += (noise[GAP_RATE] * dt) ** 2
-        push = (noise[GAP_ACCEL] * dt) ** 2
-        velocity += push
-        cross += 0.5 * dt * push
-        position += 0.25 * dt * dt * push
+    if interval > noise[GAP_S]:
+        gyro += noise[GAP_RATE] ** 2 * interval
+        accel += noise[GAP_ACCEL] ** 2 * interval
     for i in range(3):
-        P[i, i] += attitude
-        P[POSITION_ERROR + i, POSITION_ERROR + i] += position
-        P[VELOCITY_ERROR + i, VELOCITY_ERROR + i] += velocity
-        P[POSITION_ERROR + i, VELOCITY_ERROR + i] += cross
-        P[VELOCITY_ERROR + i, POSITION_ERROR + i] += cross
+        P[i, i] += gyro * dt
+        P[POSITION_ERROR + i, POSITION_ERROR + i] += accel * dt**3 / 3.0
+        P[VELOCITY_ERROR + i, VELOCITY_ERROR + i] += accel * dt
+        P[POSITION_ERROR + i, VELOCITY_ERROR + i] += 0.5 * accel * dt * dt
+        P[VELOCITY_ERROR + i, POSITION_ERROR + i] += 0.5 * accel * dt * dt
         P[GYRO_BIAS_ERROR + i, GYRO_BIAS_ERROR + i] += noise[GYRO_WALK] ** 2 * dt
         P[ACCEL_BIAS_ERROR + i, ACCEL_BIAS_ERROR + i] += noise[ACCEL_WALK] ** 2 * dt
 

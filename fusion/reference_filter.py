@@ -100,18 +100,19 @@ class ReferenceFilter:
             if m.noise[odometry.IS_ODOMETRY]:
                 self._step_by_odometry((stop - now) * 1e-9, imu_values[k])
             else:
-                self._step((stop - now) * 1e-9, imu_values[k] + share * (imu_values[k + 1] - imu_values[k]))
+                values = imu_values[k] + share * (imu_values[k + 1] - imu_values[k])
+                self._step((stop - now) * 1e-9, (imu_stamps[k + 1] - imu_stamps[k]) * 1e-9, values)
             c[memory.NOW] = stop
             c[memory.IMU_AT] += stop == imu_stamps[k + 1]
 
-    def _step(self, dt: float, values: Array) -> None:
+    def _step(self, dt: float, interval: float, values: Array) -> None:
         m = self.m
         if not self.tracking:  # no covariance yet; the compiled step also keeps the mean specific force
             imu.propagate_nominal(m.x, dt, values[:3].copy(), values[3:].copy(), self.work.step)
             filter_loop._watch_gravity(m, self.work, dt)
             return
         m.x[:], F = transition(m.x, dt, values[:3], values[3:], self.layout)
-        self.spread(F, process_noise(self.layout.n_error, dt, m.noise))
+        self.spread(F, process_noise(self.layout.n_error, dt, interval, m.noise))
 
     def _step_by_odometry(self, dt: float, twist: Array) -> None:
         m = self.m

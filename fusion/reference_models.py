@@ -117,16 +117,16 @@ def odometry_transition(x: Array, dt: float, rate: Array, velocity: Array, layou
     return moved, F
 
 
-def process_noise(n: int, dt: float, noise: Array) -> Array:
-    """Return the dense Q (n, n) of `dt` seconds, Sola eq. 261 with the position integrated; a long dt is a gap."""
+def process_noise(n: int, dt: float, interval: float, noise: Array) -> Array:
+    """Return the dense Q (n, n) of `dt` seconds, Sola eq. 261 position integrated; a long interval is a gap."""
     Q, I = np.zeros((n, n)), np.eye(3)  # noqa: E741
-    gap = dt > noise[imu.GAP_S]
-    push = (noise[imu.GAP_ACCEL] * dt) ** 2 if gap else 0.0
-    accel = noise[imu.ACCEL_NOISE] ** 2
-    Q[ATT, ATT] = (noise[imu.GYRO_NOISE] ** 2 * dt + ((noise[imu.GAP_RATE] * dt) ** 2 if gap else 0.0)) * I
-    Q[VEL, VEL] = (accel * dt + push) * I
-    Q[POS, VEL] = Q[VEL, POS] = (0.5 * accel * dt**2 + 0.5 * dt * push) * I
-    Q[POS, POS] = (accel * dt**3 / 3.0 + 0.25 * dt**2 * push) * I
+    gap = interval > noise[imu.GAP_S]
+    gyro = noise[imu.GYRO_NOISE] ** 2 + (noise[imu.GAP_RATE] ** 2 * interval if gap else 0.0)
+    accel = noise[imu.ACCEL_NOISE] ** 2 + (noise[imu.GAP_ACCEL] ** 2 * interval if gap else 0.0)
+    Q[ATT, ATT] = gyro * dt * I
+    Q[VEL, VEL] = accel * dt * I
+    Q[POS, VEL] = Q[VEL, POS] = 0.5 * accel * dt**2 * I
+    Q[POS, POS] = accel * dt**3 / 3.0 * I
     Q[BG, BG] = noise[imu.GYRO_WALK] ** 2 * dt * I
     Q[BA, BA] = noise[imu.ACCEL_WALK] ** 2 * dt * I
     return Q

@@ -1,0 +1,112 @@
+"""Odometry and constant velocity in the place of an IMU, and what happens without an IMU's samples."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import RigidTransform
+
+from fusion import odometry
+from fusion.fuse import fuse
+from fusion.nav_state import StateLayout, local_state, nominal_state, retract_state
+from fusion.options import FuseOptions
+from fusion.simulate import SimulationOptions, simulate
+from poet_loc.core.input_error import InputError
+from poet_loc.core.records import ImuSamples
+from poet_loc.core.trajectory import Trajectory
+
+
+def test_odometry_returns_its_own_poses():
+    rng = np.random.default_rng(0)
+    stamps = np.cumsum(rng.integers(20_000_000, 50_000_000, size=30)).astype(np.int64)
+    steps = RigidTransform.from_exp_coords(0.2 * rng.normal(size=(30, 6)))
+    poses = [steps[0]]
+    for step in steps[1:]:
+        poses.append(poses[-1] * step)
+    T_odom_cam = Trajectory(stamps, RigidTransform.concatenate(poses))
+    samples = odometry.odometry_samples(T_odom_cam, RigidTransform.identity())
+    x = nominal_state(StateLayout(), T_world_imu=poses[0])
+    for k, dt in enumerate(np.diff(stamps) * 1e-9):
+        for share in (0.3, 0.7):  # in two parts: the twist is constant between two poses
+            twist = samples.angular_velocity[k], samples.specific_force[k]
+            odometry.move_by_odometry(x, share * dt, *twist, np.zeros(64))
+    np.testing.assert_allclose(x[9:12], poses[-1].translation, atol=1e-9)
+    np.testing.assert_allclose(x[:9].reshape(3, 3), poses[-1].rotation.as_matrix(), atol=1e-9)
+
+
+def test_odometry_spreads_covariance_by_its_derivative():
+    rng = np.random.default_rng(1)
+    layout = StateLayout(n_objects=1, extrinsics=True, bias_kinds=1)
+    n, dt = layout.n_error, 0.3
+    x = nominal_state(layout, T_world_imu=RigidTransform.from_exp_coords(rng.normal(size=6)))
+    rate, velocity, work = rng.normal(size=3), rng.normal(size=3), np.zeros(64)
+
+    def moved(state):
+        state = state.copy()
+        odometry.move_by_odometry(state, dt, rate, velocity, work)
+        return state
+
+    F, after = np.zeros((n, n)), moved(x)
+    for j in range(n):
+        error = 1e-6 * np.eye(n)[j]
+        ahead, behind = moved(retract_state(x, error, layout)), moved(retract_state(x, -error, layout))
+        F[:, j] = (local_state(after, ahead, layout) - local_state(after, behind, layout)) / 2e-6
+    F[6:9] = np.eye(n)[6:9]  # the velocity is odometry's own and carries no error of the state
+    A = rng.normal(size=(n, n))
+    P = A @ A.T
+    spread = P.copy()
+    moved(x)
+    odometry.spread_by_odometry(spread, x[:9].copy(), dt, np.zeros(12), layout.as_integers(), work)
+    np.testing.assert_allclose(spread, F @ P @ F.T, atol=1e-6 * np.abs(P).max())
+
+
+@pytest.fixture(scope="module")
+def log():
+    return simulate(SimulationOptions(duration_s=15.0, noise="white", objects=5, odometry=True, seed=2))
+
+
+def rmse(result, log) -> float:
+    truth = log.T_world_imu.between(int(result.stamps_ns[0]), int(result.stamps_ns[-1]))
+    estimate, _ = result.trajectory.interpolate(truth.stamps_ns)
+    return float(np.sqrt(np.mean(np.sum((estimate.translation - truth.T_world_body.translation) ** 2, axis=1))))
+
+
+@pytest.mark.parametrize("motion", ["odometry", "constant-velocity"])
+def test_a_log_without_imu_is_fused(log, motion):
+    without = replace(log, imu=None)
+    result = fuse(without, FuseOptions(motion=motion))
+    assert result.motion == motion
+    assert result.body == "imu"
+    assert rmse(result, log) < 0.04
+
+
+def test_auto_takes_the_best_there_is_and_says_so(log):
+    assert fuse(log).motion == "imu"
+    assert fuse(replace(log, imu=None)).motion == "odometry"
+    assert fuse(replace(log, imu=None, T_odom_cam=None)).motion == "constant-velocity"
+    with pytest.raises(InputError, match=r"imu\.csv"):
+        fuse(replace(log, imu=None), FuseOptions(motion="imu"))
+
+
+def test_without_calibration_the_camera_itself_is_followed(log):
+    result = fuse(replace(log, imu=None, calibration=None))
+    assert result.body == "cam"
+    truth = log.T_world_cam.between(int(result.stamps_ns[0]), int(result.stamps_ns[-1]))
+    estimate, _ = result.trajectory.interpolate(truth.stamps_ns)
+    error = np.linalg.norm(estimate.translation - truth.T_world_body.translation, axis=1)
+    assert np.median(error) < 0.03
+
+
+def test_a_gap_of_the_imu_is_bridged_with_growing_sigma(log):
+    keep = (log.imu.stamps_ns < log.imu.stamps_ns[0] + 6_000_000_000) | (
+        log.imu.stamps_ns > log.imu.stamps_ns[0] + 7_000_000_000
+    )
+    samples = ImuSamples(log.imu.stamps_ns[keep], log.imu.angular_velocity[keep], log.imu.specific_force[keep])
+    result, whole = fuse(replace(log, imu=samples)), fuse(log)
+    end = int(log.imu.stamps_ns[0]) + 7_000_000_000
+    at, at_whole = np.searchsorted(result.stamps_ns, end), np.searchsorted(whole.stamps_ns, end)
+    assert np.all(np.isfinite(result.sigmas))
+    assert result.sigmas[at, 6:9].max() > 2 * whole.sigmas[at_whole, 6:9].max()
+    assert rmse(result, log) < 0.1
