@@ -9,13 +9,13 @@ from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import chi2
 
 from fusion import consensus, eskf, filter_loop, imu, memory, odometry
 from fusion.measurements import CAMERA_POSE, OBJECT_POSE, Measurements, ray_aligned_covariance
 from fusion.motion_source import Kind, motion_source
 from fusion.nav_state import ACCEL_BIAS_ERROR, CORE, GYRO_BIAS_ERROR, VELOCITY_ERROR, StateLayout, nominal_state
 from fusion.options import DetectionBias, FuseOptions
+from poet_loc.core.consistency import chi_square_quantile
 from poet_loc.core.input_error import InputError
 from poet_loc.core.records import Calibration, CameraPoses, ImuNoise, ImuSamples, LandmarkMap, ObjectPoses
 from poet_loc.io.log_folder import Log
@@ -255,7 +255,7 @@ def _anchor(problem: Problem) -> int:
 
 def _limits(options: FuseOptions) -> list[float]:
     gate = options.gate
-    both, half = chi2.ppf(gate.probability, 6), chi2.ppf(gate.probability, 3)
+    both, half = (float(chi_square_quantile(gate.probability, freedom)) for freedom in (6, 3))
     return [
         both,
         half,

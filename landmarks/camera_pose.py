@@ -12,7 +12,6 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
-from scipy.stats import chi2
 
 from landmarks.association import associate
 from landmarks.consensus import (
@@ -28,6 +27,7 @@ from landmarks.landmark_map import map_arrays
 from landmarks.options import MODES, ORACLES, Memory, Mode, SolverOptions, VoteNoise
 from landmarks.votes import Votes, cast_votes, detection_covariances, vote_covariances
 from landmarks.weighted_consensus import ACCEPTED_WEIGHT, weighted_consensus
+from poet_loc.core.consistency import chi_square_quantile
 from poet_loc.core.geometry import make_pose
 from poet_loc.core.input_error import InputError
 from poet_loc.core.records import CameraPoses, LandmarkMap, ObjectPoses
@@ -178,7 +178,7 @@ def _solve_best(task: _Task) -> _Solution:
 
 
 def _solve_robust(task: _Task) -> _Solution:
-    gate = float(chi2.ppf(task.options.gate_probability, 6))
+    gate = float(chi_square_quantile(task.options.gate_probability, 6))
     hypotheses = weighted_consensus(task.votes, task.covariances, gate)
     chosen, age_s = choose_by_evidence(task.votes.stamps_ns, hypotheses, task.options.memory)
     believed, held = hypotheses[chosen], age_s > 0.0

@@ -15,9 +15,9 @@ from dataclasses import dataclass, fields
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
-from scipy.stats import chi2
 
 from landmarks.votes import Votes
+from poet_loc.core.consistency import chi_square_quantile
 from poet_loc.core.geometry import skew, so3_right_jacobian_inverse
 
 Array = NDArray[np.float64]
@@ -159,7 +159,7 @@ def _covariances(equations: _NormalEquations, R_world_cam: Array) -> Array:
     weights, inside = equations.weights, equations.weights > ACCEPTED_WEIGHT
     freedom = 6.0 * np.maximum(inside.sum(axis=1) - 1, 1)
     disagreement = np.sum(np.where(inside, equations.square, 0.0), axis=1)
-    excess = np.maximum(1.0, disagreement / chi2.ppf(0.9, freedom))
+    excess = np.maximum(1.0, disagreement / chi_square_quantile(0.9, freedom))
     of_mean = np.sum(weights[..., None, None] ** 2 * equations.information, axis=1)
     inverse = np.linalg.inv(equations.normal)
     to_world = np.zeros_like(inverse)

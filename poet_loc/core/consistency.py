@@ -13,9 +13,11 @@ from scipy.special import gammaincinv
 Array = NDArray[np.float64]
 
 
-def chi_square_quantile(probability: ArrayLike, degrees_of_freedom: int) -> Array:
+def chi_square_quantile(probability: ArrayLike, degrees_of_freedom: ArrayLike) -> Array:
     """Return what a chi-square variable exceeds with 1 - probability (without the slow import of scipy.stats)."""
-    return np.asarray(2.0 * gammaincinv(degrees_of_freedom / 2.0, np.asarray(probability, dtype=float)), dtype=float)
+    return np.asarray(
+        2.0 * gammaincinv(np.asarray(degrees_of_freedom) / 2.0, np.asarray(probability, dtype=float)), dtype=float
+    )
 
 
 def mean_bounds(degrees_of_freedom: int, samples: int, confidence: float = 0.95) -> tuple[float, float]:
