@@ -22,7 +22,5 @@ autodoc_typehints = "none"
 autodoc_member_order = "bysource"
 html_theme = "furo"
 html_title = f"poet-loc {release}"
-# pages link to files of the repository (notebooks, conventions) that are no pages
-suppress_warnings = ["myst.xref_missing"]
 
 write_options_page(Path(__file__).resolve().parent / "_generated" / "options.md")
