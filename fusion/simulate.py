@@ -13,7 +13,6 @@ from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from poet_loc.io.log_folder import Log
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from fusion.detection_errors import (
@@ -38,6 +37,7 @@ from poet_loc.core.records import (
     ObjectPoses,
 )
 from poet_loc.core.trajectory import Trajectory
+from poet_loc.io.log_folder import Log
 
 Array = NDArray[np.float64]
 Stamps = NDArray[np.int64]
