@@ -18,7 +18,8 @@ from poet_loc.cli.terminal import Report
 from poet_loc.io.camera_poses_csv import write_camera_poses
 from poet_loc.io.tum import write_tum
 from poet_loc.io.whole_folder import write_whole_file
-from poet_loc.report.error_tables import Block, table_text
+from poet_loc.report.error_tables import Block, consistency_table, error_table, table_text
+from poet_loc.report.html_report import write_report
 from poet_loc.report.run_folder import write_states
 from poet_loc.report.summary import to_summary, write_errors_csv, write_summary
 
@@ -50,7 +51,7 @@ def write_run(folder: Path, estimates: Estimates, asked: Any, report: Report, pi
         write_whole_file(folder / "table.tex", [table_text([Block(summary)], "latex")])
     write_whole_file(folder / "options.yaml", [options_text(asked)])
     if pictures:
-        _write_pictures(folder, estimates, report)
+        _write_pictures(folder, estimates, asked, report)
 
 
 def write_localized(folder: Path, result: LocalizeResult) -> None:
@@ -92,12 +93,16 @@ def _places(folder: Path, name: str, rivals: int) -> Iterator[Path]:
         yield place
 
 
-def _write_pictures(folder: Path, estimates: Estimates, report: Report) -> None:
+def _write_pictures(folder: Path, estimates: Estimates, asked: Any, report: Report) -> None:
     record = estimates.record
     report.step("draw figures")
     from poet_loc.report.figures import write_figures
 
-    write_figures(record, folder / "figures")
+    figures = write_figures(record, folder / "figures")
+    blocks = [] if estimates.evaluation is None else [Block(to_summary(estimates.evaluation))]
+    tables = [table for table in (error_table(blocks), consistency_table(blocks)) if blocks and table.rows]
+    title = f"{estimates.log.path.resolve().name}: {', '.join(estimate.name for estimate in record.estimates)}"
+    write_report(folder / "report.html", title, tables, figures, options_text(asked))
     report.step("record for rerun")
     from poet_loc.report.rerun_log import write_recording
 

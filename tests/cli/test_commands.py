@@ -34,6 +34,7 @@ FILES = {
     "table.tex",
     "figures",
     "recording.rrd",
+    "report.html",
     "options.yaml",
     "localize",
     "fuse",
