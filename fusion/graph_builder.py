@@ -28,6 +28,7 @@ from fusion.graph_factors import (
     pose3,
     pose_key,
     pose_to_filter,
+    put_core,
     velocity_key,
 )
 from fusion.measurements import OBJECT_POSE
@@ -84,13 +85,11 @@ class GraphBuilder:
 
     def _clear(self) -> None:
         self.graph, self.values = gtsam.NonlinearFactorGraph(), gtsam.Values()
-        self.times: dict[int, float] = {}
+        self.keyframes: dict[int, int] = {}
 
-    def take(self) -> tuple[gtsam.NonlinearFactorGraph, gtsam.Values, dict[int, float]]:
-        """Return what was added since the last call, with the lasting variables' times renewed."""
-        for key in self.lasting_keys:
-            self.times[key] = self.stamp_ns * 1e-9
-        added = self.graph, self.values, self.times
+    def take(self) -> tuple[gtsam.NonlinearFactorGraph, gtsam.Values, dict[int, int]]:
+        """Return what was added since the last call: factors, initial values, each variable's keyframe."""
+        added = self.graph, self.values, self.keyframes
         self._clear()
         return added
 
@@ -131,6 +130,7 @@ class GraphBuilder:
         self, key: int, x: Array, at: int, name: str, index: int, blocks: list[Array], indices: list[int]
     ) -> None:
         self.values.insert(key, pose3(x, at))
+        self.keyframes[key] = self.keyframe
         blocks.append(pose_to_filter(x[at : at + 9].reshape(3, 3)))
         part = self.layout.error_slice(name, index)
         indices.extend(range(part.start, part.stop))
@@ -142,17 +142,20 @@ class GraphBuilder:
         self.values.insert(velocity_key(k), x[VELOCITY : VELOCITY + 3])
         self.values.insert(imu_bias_key(k), imu_bias(x))
         for key in (pose_key(k), velocity_key(k), imu_bias_key(k)):
-            self.times[key] = stamp_ns * 1e-9
+            self.keyframes[key] = k
 
     def add_keyframe(
-        self, stamp_ns: int, x: Array, between: Iterable[Detection], bias: gtsam.imuBias.ConstantBias
+        self, stamp_ns: int, x: Array, before: Array, between: Iterable[Detection], bias: gtsam.imuBias.ConstantBias
     ) -> None:
         """Add a keyframe that starts from x, the IMU up to it (summed at a bias) and the detections on the way."""
         for detection in between:
             self.add_detection(detection)
         summed = self.imu.preintegrate(self.stamp_ns, stamp_ns, bias)
         self.graph.add(imu_factor(self.keyframe, self.keyframe + 1, summed))
-        self._add_variables(stamp_ns, x)
+        predicted = x.copy()
+        state = summed.predict(gtsam.NavState(pose3(before, 0), before[VELOCITY : VELOCITY + 3]), bias)
+        put_core(predicted, state.pose(), state.velocity(), bias)
+        self._add_variables(stamp_ns, predicted)
 
     def add_detection(self, detection: Detection) -> None:
         """Add a detection to the newest keyframe."""
@@ -204,7 +207,7 @@ class GraphBuilder:
             self.graph.add(bias_factor(chain.key, key, phi, sigma))
             chain.mean = phi * chain.mean
         self.values.insert(key, chain.mean)
-        self.times[key] = self.stamp_ns * 1e-9
+        self.keyframes[key] = self.keyframe
         chain.key, chain.stamp_ns = key, self.stamp_ns
 
     def set_bias_means(self, means: Mapping[tuple[int, int], Array]) -> None:

@@ -195,7 +195,7 @@ def robust(options: Graph, covariance: Array) -> gtsam.noiseModel.Base:
     if options.kernel == "none":
         return gaussian
     kernels: Any = gtsam.noiseModel.mEstimator
-    kernel = {"huber": kernels.Huber, "cauchy": kernels.Cauchy, "geman-mcclure": kernels.GemanMcClure}[options.kernel]
+    kernel = {"huber": kernels.Huber, "cauchy": kernels.Cauchy}[options.kernel]
     return gtsam.noiseModel.Robust.Create(kernel.Create(options.kernel_width), gaussian)
 
 

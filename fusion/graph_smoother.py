@@ -33,13 +33,15 @@ from fusion.prepare import Problem
 
 Array = NDArray[np.float64]
 
+_LOOSE = 3  # keyframes at the end of the window that an ordinary update may order anew
+
 
 def isam_parameters(options: Graph) -> gtsam.ISAM2Params:
     """Return parameters under which the IMU's small noise leaves no indeterminate system: QR, not Cholesky."""
     params = gtsam.ISAM2Params()
     params.setFactorization("QR")
     params.setRelinearizeThreshold(options.relinearize)
-    params.relinearizeSkip = 1
+    params.relinearizeSkip = 1_000_000_000
     params.findUnusedFactorSlots = True
     return params
 
@@ -70,21 +72,28 @@ class FixedLagSmoother:
 
     def __init__(self, builder: GraphBuilder, options: Graph) -> None:
         self.builder = builder
-        self._smoother = gtsam.IncrementalFixedLagSmoother(options.lag_s, isam_parameters(options))
+        self._window = max(2, round(options.lag_s * options.keyframe_rate_hz))
+        self._relinearize_every = options.relinearize_every
+        self._smoother = gtsam.ISAM2(isam_parameters(options))
+        self._passing: dict[int, int] = {}
+        self._lasting: set[int] = set()
+        self._updates = 0
 
     def start(self, keyframe: Keyframe, walk: Walk) -> None:
         """Begin at a keyframe with the filter's state as prior."""
         m = walk.memory
         self.builder.start(keyframe.stamp_ns, m.x, m.P)
+        self._first = self.builder.keyframe
         self._update()
         self._bias = imu_bias(m.x)
+        self._x = m.x.copy()
 
     def extend(self, keyframe: Keyframe, walk: Walk, problem: Problem) -> None:
         """Add a keyframe and what was measured since the last one; correct the filter's state with the result."""
         builder, x = self.builder, walk.memory.x
         gyro_accel = np.concatenate([self._bias.gyroscope(), self._bias.accelerometer()])
         between = detections(walk, problem, keyframe.between, builder.stamp_ns, gyro_accel)
-        builder.add_keyframe(keyframe.stamp_ns, x, between, self._bias)
+        builder.add_keyframe(keyframe.stamp_ns, x, self._x, between, self._bias)
         for i, half in np.argwhere(keyframe.forgotten):
             kind, k = divmod(int(i), builder.layout.n_objects)
             builder.forget(k, kind, int(half))
@@ -94,8 +103,39 @@ class FixedLagSmoother:
         self.write_back(walk.memory)
 
     def _update(self) -> None:
-        graph, values, times = self.builder.take()
-        self._smoother.update(graph, values, times)  # type: ignore[arg-type]
+        """Take in what is new, eliminated in order of time with the lasting variables last; let the oldest go.
+
+        In that order a new keyframe touches the end of the window only, and the oldest variables are leaves.
+        """
+        builder, newest = self.builder, self.builder.keyframe
+        graph, values, keyframes = builder.take()
+        self._passing |= keyframes
+        lasting = set(builder.lasting_keys)
+        for key in self._lasting - lasting:
+            self._passing[key] = newest - 1  # until now it was eliminated behind all keyframes before this one
+        self._lasting = lasting
+        self._updates += 1
+        whole = self._relinearize_every > 0 and self._updates % self._relinearize_every == 0
+        oldest = max(self._first, newest - (self._window if whole else _LOOSE))
+        groups, again = gtsam.KeyGroupMap(), gtsam.KeyList()
+        for key, keyframe in self._passing.items():
+            if key in lasting:
+                groups.insert2(key, newest - oldest + 1)
+            else:
+                groups.insert2(key, max(0, keyframe - oldest))
+            if whole and key not in keyframes:
+                again.push_back(key)
+        self._smoother.update(graph, values, [], groups, None, again, whole)
+        self._let_go(newest - self._window)
+
+    def _let_go(self, until: int) -> None:
+        leaving = sorted((k, key) for key, k in self._passing.items() if k <= until and key not in self._lasting)
+        if leaving:
+            keys = gtsam.KeyList()
+            for _, key in leaving:
+                keys.push_back(key)
+                del self._passing[key]
+            self._smoother.marginalizeLeaves(keys)
 
     def write_back(self, m: Memory) -> None:
         """Give the filter's memory the newest state and the joint covariance of all that it holds."""
@@ -127,6 +167,7 @@ class FixedLagSmoother:
                 m.x[layout.nominal_bias(j, kind)] = phi * chain.mean
                 include(chain.key, np.diag(phi), sigma**2, layout.error_slice("biases", j, kind))
         J = block_diag(*blocks)
-        joint = smoother.getISAM2().jointMarginalCovariance(keys).fullMatrix()
+        joint = smoother.jointMarginalCovariance(keys).fullMatrix()
         P = J @ joint @ J.T + np.diag(np.concatenate(added))
         m.P[np.ix_(indices, indices)] = 0.5 * (P + P.T)
+        self._x = m.x.copy()
