@@ -174,7 +174,7 @@ class BatchLeastSquares:
         for i, (dt, value) in enumerate(zip(self.steps, self.values)):
             moved, F = transition(x[i], dt, value[:3], value[3:], self.layout)
             step = local_state(x[i + 1], moved, self.layout)
-            yield process_noise(n, dt, self.noise), step, {i: -F, i + 1: np.eye(n)}
+            yield process_noise(n, dt, dt, self.noise), step, {i: -F, i + 1: np.eye(n)}
         for i, kind, k, R_m, t_m, R in zip(*self.poses):
             rate = self.rates[i] - x[i][GYRO_BIAS : GYRO_BIAS + 3]
             r, H = residual_and_jacobian(int(kind), int(k), R_m.reshape(3, 3), t_m, x[i], rate, 0.0, self.layout)
