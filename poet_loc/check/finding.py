@@ -8,6 +8,8 @@ from typing import Any, Literal
 
 from poet_loc.io.log_folder import Log
 
+Evidence = dict[str, float | int | str]
+
 Severity = Literal["error", "warning"]
 """error: results would be wrong or there would be none; warning: results would be worse than they could be."""
 

@@ -11,7 +11,7 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from landmarks.camera_pose import solve
 from landmarks.options import SolverOptions
-from poet_loc.check.finding import Finding
+from poet_loc.check.finding import Evidence, Finding
 from poet_loc.check.units import GRAVITY
 from poet_loc.core.geometry import make_pose
 from poet_loc.core.records import CameraPoses, ImuSamples, LandmarkMap
@@ -41,7 +41,7 @@ def check_gravity(log: Log) -> Iterator[Finding]:
         return
     file = next(iter(wrong))
     mean = means[file]
-    evidence = {f"mean_force_{axis}_m_s2": float(value) for axis, value in zip("xyz", mean, strict=True)}
+    evidence: Evidence = {f"mean_force_{axis}_m_s2": float(value) for axis, value in zip("xyz", mean, strict=True)}
     evidence |= {"tilt_deg": wrong[file], "seen_from": file, "files_that_agree": f"{len(wrong)} of {len(tilts)}"}
     if len(wrong) < len(tilts):
         what = f"gravity lies {wrong[file]:.0f} deg from where it is in the other files"
@@ -57,7 +57,7 @@ def check_gravity(log: Log) -> Iterator[Finding]:
         yield Finding("gravity-tilted", "error", _world_file(log), what, fix, evidence)
 
 
-def _upside_down(log: Log, body: Trajectory, evidence: dict[str, float | str]) -> Finding:
+def _upside_down(log: Log, body: Trajectory, evidence: Evidence) -> Finding:
     """Tell an accelerometer that measures gravity from a world that is upside down, by its answer to motion."""
     assert log.imu is not None
     answer = _answer_to_motion(log.imu, body)

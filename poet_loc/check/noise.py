@@ -7,7 +7,7 @@ from collections.abc import Iterator
 import numpy as np
 from numpy.typing import NDArray
 
-from poet_loc.check.finding import Finding
+from poet_loc.check.finding import Evidence, Finding
 from poet_loc.io.log_folder import Log
 
 Array = NDArray[np.float64]
@@ -38,7 +38,7 @@ def check_noise(log: Log) -> Iterator[Finding]:
         if value != 0.0 and not low <= value <= high:
             what = f"{name} is implausible for any IMU"
             fix = f"its unit is {_UNITS[name]}: data sheets give deg/s or ug and the discrete value x sqrt(rate)"
-            evidence = {"stated": value, "least_plausible": low, "largest_plausible": high}
+            evidence: Evidence = {"stated": value, "least_plausible": low, "largest_plausible": high}
             yield Finding("noise-implausible", "error", "calibration.yaml", what, fix, evidence)
     if log.imu is None or len(log.imu) < 4 * _WINDOW:
         return
@@ -57,7 +57,7 @@ def _against_data(name: str, stated: float, samples: Array, rate: float) -> Iter
     measured = float(_quiet_sigma(samples) / np.sqrt(rate))
     if measured == 0.0:
         return
-    evidence = {
+    evidence: Evidence = {
         "stated": stated,
         "quietest_second_in_the_data": measured,
         "data_over_stated": measured / stated,

@@ -14,7 +14,7 @@ from landmarks.association import associate
 from landmarks.camera_pose import solve
 from landmarks.landmark_map import map_arrays
 from landmarks.options import SolverOptions
-from poet_loc.check.finding import Finding
+from poet_loc.check.finding import Evidence, Finding
 from poet_loc.check.gravity import solved
 from poet_loc.check.turn_rates import READINGS, Reading, reread
 from poet_loc.core.records import LandmarkMap, ObjectPoses
@@ -22,6 +22,7 @@ from poet_loc.core.trajectory import Trajectory
 from poet_loc.io.log_folder import Log, object_poses_file
 
 Array = NDArray[np.float64]
+Rows = NDArray[np.intp]
 
 _LEAST_SEEN = 20
 _MOST_ROWS = 1500
@@ -41,7 +42,7 @@ def check_unknown_objects(log: Log) -> Iterator[Finding]:
         if not unknown.any():
             continue
         ids, counts = np.unique(poses.object_ids[unknown], return_counts=True)
-        evidence = {
+        evidence: Evidence = {
             "unknown_objects": ", ".join(map(str, ids.tolist())),
             "detections_of_each": ", ".join(map(str, counts.tolist())),
             "of_all_detections": len(poses),
@@ -77,7 +78,7 @@ def check_rotations_against_map(log: Log) -> Iterator[Finding]:
     order = sorted(table, key=lambda both: table[both] + 2.0 * sum(reading != "as is" for reading in both))
     of_detections, of_map = order[0]
     clear = table[order[0]] < _FITS_DEG and table[order[1]] > table[order[0]] + _FITS_DEG
-    evidence = {
+    evidence: Evidence = {
         "median_misfit_deg": own[name],
         f"misfit_deg_detections_{of_detections}_map_{of_map}": table[order[0]],
         "next_best_deg": table[order[1]],
@@ -119,7 +120,7 @@ def check_landmarks(log: Log) -> Iterator[Finding]:
         best = min(seen, key=lambda table: table[index].offset_m)
         mine = best[index]
         others = [residual for key, residual in best.items() if key != index]
-        evidence = {
+        evidence: Evidence = {
             "object_id": landmark.object_id,
             "instance": landmark.instance,
             "offset_m": mine.offset_m,
@@ -151,7 +152,7 @@ def check_ground_truth(log: Log) -> Iterator[Finding]:
         return
     name = min(gaps, key=lambda each: gaps[each])
     T, (distance, angle) = from_votes[name], gaps[name]
-    evidence = {"median_distance_m": distance, "median_angle_deg": angle, "against": object_poses_file(name)}
+    evidence: Evidence = {"median_distance_m": distance, "median_angle_deg": angle, "against": object_poses_file(name)}
     for reading in READINGS[1:]:
         gap = _gap(T, log.T_world_cam, reading)
         if gap is not None and gap[0] < 0.3 and gap[1] < _FITS_DEG:
@@ -168,7 +169,7 @@ def check_ground_truth(log: Log) -> Iterator[Finding]:
     yield Finding("ground-truth-apart", "error", "T_world_cam.tum", what, fix, evidence)
 
 
-def _pairs(poses: ObjectPoses, landmark_map: LandmarkMap) -> tuple[NDArray, NDArray, NDArray, NDArray]:
+def _pairs(poses: ObjectPoses, landmark_map: LandmarkMap) -> tuple[Rows, Rows, Rows, Rows]:
     """Return rows i, j of detections in one frame, and the landmarks a, b that they are; only unsymmetric ones."""
     places = {each.key: index for index, each in enumerate(landmark_map) if each.symmetry is None}
     keys = zip(poses.object_ids.tolist(), poses.instances.tolist(), strict=True)
@@ -183,7 +184,7 @@ def _pairs(poses: ObjectPoses, landmark_map: LandmarkMap) -> tuple[NDArray, NDAr
 
 
 def _misfit(
-    poses: ObjectPoses, landmark_map: LandmarkMap, pairs: tuple[NDArray, ...], detections: Reading, mapped: Reading
+    poses: ObjectPoses, landmark_map: LandmarkMap, pairs: tuple[Rows, ...], detections: Reading, mapped: Reading
 ) -> float:
     """Return how far detections and map are apart on where one object is in another's frame, deg.
 
@@ -251,7 +252,7 @@ def _gap(T_world_cam: Trajectory, truth: Trajectory, reading: Reading) -> tuple[
     return float(np.median(distance)), float(np.median(angle))
 
 
-def _without(name: str, ids: NDArray):  # type: ignore[no-untyped-def]
+def _without(name: str, ids: NDArray[np.int64]):  # type: ignore[no-untyped-def]
     def repair(log: Log) -> Log:
         poses = log.object_poses[name]
         return replace(log, object_poses={**log.object_poses, name: poses[~np.isin(poses.object_ids, ids)]})

@@ -11,8 +11,8 @@ from typing import Any, TypeVar
 import numpy as np
 import yaml
 
-from poet_loc.check.finding import Finding
-from poet_loc.check.rows import Rows, in_order, read_csv_rows, read_plain_rows, with_unit_quaternions, without_nan
+from poet_loc.check.finding import Evidence, Finding
+from poet_loc.check.rows import Mask, Rows, in_order, read_csv_rows, read_plain_rows, with_unit_quaternions, without_nan
 from poet_loc.core.geometry import pose_from_quaternion
 from poet_loc.core.input_error import InputError
 from poet_loc.core.records import Calibration, CameraPoses, ImuSamples, ObjectPoses
@@ -54,7 +54,7 @@ def read_what_there_is(path: Path) -> tuple[Log, list[Finding]]:
             try:
                 record, problems = tolerantly(file)
             except InputError as unreadable:
-                record, problems = None, [_unreadable(file, unreadable)]  # type: ignore[assignment]
+                record, problems = None, [_unreadable(file, unreadable)]
             found.extend(problems or [_unreadable(file, error)])
             return record
 
@@ -75,7 +75,7 @@ def read_what_there_is(path: Path) -> tuple[Log, list[Finding]]:
 
 
 def _unreadable(file: Path, error: InputError) -> Finding:
-    evidence = {} if error.line is None else {"line": error.line}
+    evidence: Evidence = {} if error.line is None else {"line": error.line}
     return Finding("unreadable", "error", file.name, error.what, error.fix or "correct the file", evidence)
 
 
@@ -138,12 +138,13 @@ def _object_poses(file: Path) -> tuple[ObjectPoses, list[Finding]]:
     distance = float(np.median(np.linalg.norm(rows.numbers[:, :3], axis=1)))
     if distance > _MILLIMETRES_M:
         what, fix = "translations are millimetres, it seems", "divide tx, ty, tz by 1000: metres belong here"
-        evidence = {"median_distance": round(distance, 1)}
+        evidence: Evidence = {"median_distance": round(distance, 1)}
         found.append(Finding("millimetres", "error", file.name, what, fix, evidence, repaired_in_reading=True))
         rows = replace(rows, numbers=rows.numbers / np.where(np.arange(rows.numbers.shape[1]) < 3, 1000.0, 1.0))
     covariances, bad = _covariances(rows, 8) if has_covariance else (None, [])
     scores = np.nan_to_num(rows.numbers[:, 7], nan=0.0)
-    return ObjectPoses(*rows.integers.T, scores, _poses(rows), covariances), found + bad
+    columns = (rows.integers[:, 0], rows.integers[:, 1], rows.integers[:, 2], rows.integers[:, 3])
+    return ObjectPoses(*columns, scores, _poses(rows), covariances), found + bad
 
 
 def _covariances(rows: Rows, first: int) -> tuple[np.ndarray, list[Finding]]:
@@ -151,7 +152,7 @@ def _covariances(rows: Rows, first: int) -> tuple[np.ndarray, list[Finding]]:
     covariances = np.empty((len(rows), 6, 6))
     covariances[:, _UPPER[0], _UPPER[1]] = covariances[:, _UPPER[1], _UPPER[0]] = upper
     absent = np.isnan(upper).all(axis=1)
-    bad = ~absent & (~np.isfinite(upper).all(axis=1))
+    bad: Mask = np.asarray(~absent & ~np.isfinite(upper).all(axis=1))
     bad[~absent & ~bad] = not_positive_definite(covariances[~absent & ~bad])
     covariances[bad] = np.nan
     if not bad.any():
@@ -178,5 +179,5 @@ def _calibration(file: Path) -> tuple[Calibration | None, list[Finding]]:
         corrected.write_text(yaml.safe_dump(content), encoding="utf-8")
         calibration = read_calibration(corrected)
     what, fix = f"the lever arm of {name} is millimetres, it seems", "divide its translation by 1000"
-    evidence = {"lever_arm": round(lever, 2)}
+    evidence: Evidence = {"lever_arm": round(lever, 2)}
     return calibration, [Finding("millimetres", "error", file.name, what, fix, evidence, repaired_in_reading=True)]

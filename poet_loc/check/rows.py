@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from poet_loc.check.finding import Finding
+from poet_loc.check.finding import Evidence, Finding
 from poet_loc.core.input_error import InputError
 from poet_loc.io.input_text import read_text
 
@@ -99,7 +99,7 @@ def _parsed(path, split: Iterable[tuple[int, list[str]]], width, picked, count, 
     rows = Rows(path, np.array(lines), np.array(integers, np.int64), np.array(numbers, float))
     if not bad:
         return rows, []
-    evidence = {"rows": len(bad), "of": len(lines) + len(bad), "lines": shown_lines(bad)}
+    evidence: Evidence = {"rows": len(bad), "of": len(lines) + len(bad), "lines": shown_lines(bad)}
     what = f"rows cannot be read: {width} numbers belong on each"
     return rows, [Finding("rows", "error", path.name, what, "leave them out", evidence, repaired_in_reading=True)]
 
@@ -120,7 +120,7 @@ def _nanoseconds(text: str) -> int:
 
 def without_nan(rows: Rows, columns: slice) -> tuple[Rows, list[Finding]]:
     """Return the rows whose numbers are finite."""
-    bad = ~np.isfinite(rows.numbers[:, columns]).all(axis=1)
+    bad: Mask = np.asarray(~np.isfinite(rows.numbers[:, columns]).all(axis=1))
     found = [rows.finding("not-finite", bad, "numbers are NaN or infinite", "leave such rows out")] if bad.any() else []
     return rows[~bad], found
 

@@ -7,7 +7,7 @@ from functools import partial
 
 import numpy as np
 
-from poet_loc.check.finding import Finding
+from poet_loc.check.finding import Evidence, Finding
 from poet_loc.check.streams import Stream, streams_of, with_stamps
 from poet_loc.io.log_folder import Log
 
@@ -37,7 +37,7 @@ def _unit(stream: Stream) -> Iterator[Finding]:
         return
     unit = next((name for name, ns in _UNITS_NS.items() if 1.0 <= rate / ns <= 1500.0), None)
     what = f"the stamps say {rate:.3g} Hz" + (f": they look like {unit}" if unit else "")
-    evidence = {"median_interval_s": float(np.median(stream.intervals_s)), "rate_hz": rate}
+    evidence: Evidence = {"median_interval_s": float(np.median(stream.intervals_s)), "rate_hz": rate}
     fix = "write stamps in whole nanoseconds"
     repair = None
     if unit and stream.stamps_ns[-1] < np.iinfo(np.int64).max // _UNITS_NS[unit]:
@@ -52,7 +52,7 @@ def _gaps(stream: Stream) -> Iterator[Finding]:
     if not long.size:
         return
     widest = int(long[np.argmax(stream.intervals_s[long])])
-    evidence = {
+    evidence: Evidence = {
         "gaps": len(long),
         "longest_gap_s": float(stream.intervals_s[widest]),
         "after_stamp_ns": int(stream.stamps_ns[widest]),
@@ -76,7 +76,7 @@ def _jitter(stream: Stream) -> Iterator[Finding]:
     share = float(np.percentile(deviation[multiples < 5], 90))
     if not stream.regular or share < _JITTER_SHARE:
         return
-    evidence = {"median_interval_s": median, "jitter_p90_s": share * median, "jitter_share_p90": share}
+    evidence: Evidence = {"median_interval_s": median, "jitter_p90_s": share * median, "jitter_share_p90": share}
     what = "the intervals scatter: the stamps look like times of receipt, not of measurement"
     fix = "use the stamps of the sensor (header stamps of a bag), or a driver that stamps in hardware"
     yield Finding("jitter", "warning", stream.file, what, fix, evidence)
@@ -90,7 +90,7 @@ def check_rate(log: Log) -> Iterator[Finding]:
     measured = 1.0 / float(intervals[intervals < 5.0 * np.median(intervals)].mean())
     stated = log.calibration.imu.update_rate
     if abs(measured / stated - 1.0) > _RATE_TOLERANCE:
-        evidence = {"measured_hz": measured, "stated_hz": stated}
+        evidence: Evidence = {"measured_hz": measured, "stated_hz": stated}
         what = "update_rate in calibration.yaml is not the rate of imu.csv"
         fix = "correct update_rate; noise densities that were converted with the wrong rate are wrong too"
         yield Finding("rate", "warning", "calibration.yaml", what, fix, evidence)
@@ -109,7 +109,7 @@ def check_spans(log: Log) -> Iterator[Finding]:
             shorter = min(end - start, other_end - other_start)
             if common >= _SHORT_OVERLAP * shorter and (common > 0 or shorter == 0):
                 continue
-            evidence = {
+            evidence: Evidence = {
                 "common_s": max(common, 0) / 1e9,
                 "start_s": start / 1e9,
                 "end_s": end / 1e9,

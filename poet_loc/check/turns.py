@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from poet_loc.check.finding import Finding
+from poet_loc.check.finding import Evidence, Finding
 from poet_loc.check.turn_rates import (
     READINGS,
     Match,
@@ -112,7 +112,7 @@ def _axes(compared: list[_Compared]) -> Iterator[Finding]:
         return
     if any(each.match.correlation > each.as_it_is.mirrored + 0.03 for each in told):  # type: ignore[union-attr]
         return
-    evidence = {
+    evidence: Evidence = {
         "correlation_best_rotation": match.correlation,
         "correlation_mirrored": match.mirrored,
         "against": best.source.file,
@@ -124,7 +124,7 @@ def _axes(compared: list[_Compared]) -> Iterator[Finding]:
 
 def _gyroscope_unit(compared: _Compared) -> Iterator[Finding]:
     scale = compared.match.gyroscope_scale
-    evidence = {"gyroscope_over_poses": scale, "against": compared.source.file}
+    evidence: Evidence = {"gyroscope_over_poses": scale, "against": compared.source.file}
     evidence |= {"correlation": compared.match.correlation}
     if 0.5 * _DEGREES < scale < 2.0 * _DEGREES:
         what, fix = (
@@ -149,7 +149,7 @@ def _is_inverted(compared: list[_Compared]) -> bool:
 def _inverted_extrinsics(compared: list[_Compared]) -> Finding:
     telling = [each for each in compared if each.source.body == "cam"]
     best = max(telling, key=lambda each: each.best_of("inverse"))
-    evidence = {
+    evidence: Evidence = {
         "correlation_as_written": best.best_of("as is"),
         "correlation_inverted": best.best_of("inverse"),
         "against": best.source.file,
@@ -171,7 +171,7 @@ def _readings(compared: list[_Compared], direction: Direction) -> Iterator[Findi
         clear = _fits_better(fits[best], fits["as is"]) and fits[best] > others + _CLEAN_MARGIN
         if best == "as is" or fits[best] < _TELLING or not clear:
             continue
-        evidence = {f"correlation_{reading.replace(' ', '_')}": fit for reading, fit in fits.items()}
+        evidence: Evidence = {f"correlation_{reading.replace(' ', '_')}": fit for reading, fit in fits.items()}
         repair = _reread(each.source.file, best)
         if best == "wxyz":
             what = "quaternions are written w, x, y, z, it seems: only so they turn as the gyroscope does"
@@ -194,7 +194,7 @@ def _rotation_off(compared: list[_Compared], R_cam_imu: Rotation) -> Iterator[Fi
     R_cam_imu_data = best.match.R_imu_body.inv()
     angle = np.degrees((R_cam_imu * R_cam_imu_data.inv()).magnitude())
     q = ", ".join(f"{value:.3f}" for value in R_cam_imu_data.as_quat(canonical=True))
-    evidence = {
+    evidence: Evidence = {
         "off_by_deg": float(angle),
         "correlation_as_written": written,
         "correlation_best_rotation": best.match.correlation,
@@ -231,7 +231,7 @@ def _offsets(log: Log, compared: list[_Compared]) -> Iterator[Finding]:
 
 def _offset_finding(each: _Compared, off: float, stated: float, shared: bool) -> Finding:
     measured = each.match.offset_s
-    evidence = {
+    evidence: Evidence = {
         "measured_t_imu_minus_t_pose_s": round(measured, 4),
         "expected_s": stated if each.source.body == "cam" else 0.0,
         "correlation": each.match.correlation,
@@ -281,6 +281,8 @@ def _reread(file: str, reading: Reading):  # type: ignore[no-untyped-def]
                 return replace(log, object_poses={**log.object_poses, name: other})
         field = file.split(".")[0]
         trajectory = getattr(log, field)
-        return replace(log, **{field: Trajectory(trajectory.stamps_ns, reread(trajectory.T_world_body, reading))})
+        turned = reread(trajectory.T_world_body, reading)
+        fields: dict[str, Any] = {field: Trajectory(trajectory.stamps_ns, turned)}
+        return replace(log, **fields)
 
     return repair

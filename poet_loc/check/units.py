@@ -4,11 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from poet_loc.check.finding import Finding
+from poet_loc.check.finding import Evidence, Finding
 from poet_loc.check.streams import trajectories_of
 from poet_loc.core.geometry import make_pose
 from poet_loc.core.records import LandmarkMap, ObjectPoses
@@ -37,7 +38,7 @@ def check_accelerometer(log: Log) -> Iterator[Finding]:
     for axis in np.flatnonzero(np.ptp(force, axis=0) == 0.0):
         name, value = "xyz"[axis], float(force[0, axis])
         what = f"the accelerometer's {name} axis never changes"
-        evidence = {"axis": name, "value_m_s2": value, "samples": len(force)}
+        evidence: Evidence = {"axis": name, "value_m_s2": value, "samples": len(force)}
         yield Finding("dead-axis", "error", "imu.csv", what, "look at the driver: the axis is not connected", evidence)
     _, means, scatter, _ = windows
     norm = np.linalg.norm(means, axis=1)
@@ -76,7 +77,7 @@ def check_gyroscope(log: Log) -> Iterator[Finding]:
     fast = float(np.percentile(np.linalg.norm(log.imu.angular_velocity, axis=1), 95))
     if at_rest < _LARGEST_BIAS and fast < _FASTEST_TURN:
         return
-    evidence = {"norm_at_rest_rad_s": at_rest, "as_degrees_deg_s": at_rest, "p95_rad_s": fast}
+    evidence: Evidence = {"norm_at_rest_rad_s": at_rest, "as_degrees_deg_s": at_rest, "p95_rad_s": fast}
     evidence |= {f"{name}_at_rest_rad_s": float(value) for name, value in zip("xyz", bias, strict=True)}
     what = f"the gyroscope reads {at_rest:.2g} rad/s in its quietest moments"
     if fast > _FASTEST_TURN or fast > 5.0 * at_rest or at_rest > 1.0 or wobble[still].min() > 0.02:
@@ -103,7 +104,7 @@ def check_lengths(log: Log) -> Iterator[Finding]:
     for name, ratio in wrong.items():
         file = "landmarks.json" if in_map else object_poses_file(name)
         factor = ratio if in_map else 1.0 / ratio
-        evidence = {"detected_over_mapped_distances": ratio, "detections": object_poses_file(name)}
+        evidence: Evidence = {"detected_over_mapped_distances": ratio, "detections": object_poses_file(name)}
         if abs(factor * 1e3 - 1.0) < 0.3:
             what, fix = "positions are millimetres, it seems", "divide them by 1000: metres belong here"
             repair = _map_in_metres if in_map else _detections_in_metres(name)
@@ -123,7 +124,7 @@ def _too_fast(file: str, trajectory: Trajectory) -> Iterator[Finding]:
     speed = float(np.median(steps / (np.diff(trajectory.stamps_ns) / 1e9)))
     if speed > _FASTEST_MOTION:
         what, fix = "positions are millimetres, it seems", "divide them by 1000: metres belong here"
-        evidence = {"median_speed_m_s": speed}
+        evidence: Evidence = {"median_speed_m_s": speed}
         yield Finding("millimetres", "error", file, what, fix, evidence, _trajectory_in_metres(file))
 
 
@@ -210,6 +211,7 @@ def _trajectory_in_metres(file: str):  # type: ignore[no-untyped-def]
             return replace(log, camera_poses=replace(record, T_world_cam=make_pose(T.rotation, T.translation / 1e3)))
         T = record.T_world_body
         metres = Trajectory(record.stamps_ns, make_pose(T.rotation, T.translation / 1e3))
-        return replace(log, **{field: metres})
+        fields: dict[str, Any] = {field: metres}
+        return replace(log, **fields)
 
     return repair

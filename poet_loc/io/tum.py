@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from poet_loc.core.trajectory import Trajectory
 from poet_loc.io.number_table import NumberTable, read_number_rows
-from poet_loc.io.pose_columns import POSE_COLUMNS, pose_cells, poses_of
+from poet_loc.io.pose_columns import POSE_COLUMNS, not_positive_definite, pose_cells, poses_of
 from poet_loc.io.whole_folder import write_whole_file
 
 Stamps = NDArray[np.int64]
@@ -27,9 +27,43 @@ def read_tum(path: str | Path) -> Trajectory:
     """
     table = read_number_rows(path, [("t", "S64"), *((name, float) for name in POSE_COLUMNS)], comments="#")
     T_world_body = poses_of(table)
-    stamps = _stamps_of(table)
+    stamps = read_seconds_column(table)
     table.refuse_disorder(stamps, "sort the rows by time, one per stamp, with all decimals")
     return Trajectory(stamps, T_world_body)
+
+
+def read_seconds(path: str | Path) -> Stamps:
+    """Read a file of stamps in seconds, one a line, exact to the nanosecond.
+
+    Raises InputError where they do not increase.
+    """
+    table = read_number_rows(path, [("t", "S64")], comments="#")
+    stamps = read_seconds_column(table)
+    table.refuse_disorder(stamps, "sort the stamps, each once, with all decimals")
+    return stamps
+
+
+def read_tum_with_covariances(path: str | Path) -> tuple[Trajectory, NDArray[np.float64]]:
+    """Read a trajectory with twelve columns of covariance as RPG's tools and OpenVINS write them.
+
+    t tx ty tz qx qy qz qw, then the upper triangles of two 3x3 blocks: Pr11 Pr12 Pr13 Pr22 Pr23 Pr33 of the rotation
+    (body axes, rad^2) and Pt11 .. Pt33 of the position (world axes, m^2). Returns (N, 6, 6) of [e_r, e_t] with
+    R = R_true Exp(e_r), t = t_true + e_t; the blocks between the two are not in the file and are zero.
+    """
+    blocks = [f"P{kind}{i}{j}" for kind in "rt" for i in range(3) for j in range(i, 3)]
+    columns = [("t", "S64"), *((name, float) for name in (*POSE_COLUMNS, *blocks))]
+    table = read_number_rows(path, columns, comments="#")
+    table.refuse_not_finite(blocks)
+    T_world_body, stamps = poses_of(table), read_seconds_column(table)
+    table.refuse_disorder(stamps, "sort the rows by time, one per stamp, with all decimals")
+    covariances = np.zeros((len(table), 6, 6))
+    rows, columns_ = np.triu_indices(3)
+    for offset, names in ((0, blocks[:6]), (3, blocks[6:])):
+        upper = table.stack(names)
+        covariances[:, offset + rows, offset + columns_] = covariances[:, offset + columns_, offset + rows] = upper
+    bad = not_positive_definite(covariances)
+    table.refuse(bad, "the covariance is not positive definite", "give variances above zero, rotation first")
+    return Trajectory(stamps, T_world_body), covariances
 
 
 def write_tum(path: str | Path, trajectory: Trajectory) -> None:
@@ -45,7 +79,8 @@ def seconds_text(stamp_ns: int) -> str:
     return f"{'-' if stamp_ns < 0 else ''}{seconds}.{rest:09d}"
 
 
-def _stamps_of(table: NumberTable) -> Stamps:
+def read_seconds_column(table: NumberTable) -> Stamps:
+    """Return the column t of a table, text of seconds, in nanoseconds.  Raises InputError for what is no time."""
     texts = table["t"]
     stamps, plain = _plain_decimals(texts)
     for row in np.flatnonzero(~plain):
