@@ -80,9 +80,10 @@ def _fits_better(fit: float, than: float) -> bool:
 
 
 def _compare(imu: ImuSamples, source: PoseSource, R_cam_imu: Rotation | None) -> _Compared | None:
-    as_it_is = match = match_turns(imu, turn_rates(source))
+    rates = {reading: turn_rates(source, reading) for reading in READINGS}
+    as_it_is = match = match_turns(imu, rates["as is"])
     if match is None or match.correlation < _CLEAN:  # a wrong order of the quaternion turns like an inverse
-        other = match_turns(imu, turn_rates(source, "inverse"))
+        other = match_turns(imu, rates["inverse"])
         if other is not None and (match is None or other.correlation > match.correlation + 0.01):
             match = other
     if match is None or match.correlation < _TELLING or match.correlation < match.background + 0.1:
@@ -93,7 +94,7 @@ def _compare(imu: ImuSamples, source: PoseSource, R_cam_imu: Rotation | None) ->
     elif R_cam_imu is not None:
         ways = {"as is": R_cam_imu.inv(), "inverse": R_cam_imu}
     fits = {
-        (reading, way): correlation_under(imu, turn_rates(source, reading), match.offset_s, rotation)
+        (reading, way): correlation_under(imu, rates[reading], match.offset_s, rotation)
         for reading in READINGS
         for way, rotation in ways.items()
     }

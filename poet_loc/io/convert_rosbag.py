@@ -15,6 +15,7 @@ from poet_loc.core.geometry import pose_from_quaternion
 from poet_loc.core.input_error import InputError
 from poet_loc.core.records import CameraPoses, ImuSamples, ObjectPoses
 from poet_loc.core.trajectory import Trajectory
+from poet_loc.io.bag_images import write_image
 from poet_loc.io.bag_messages import BagTopic, header_stamp_ns, open_bag, topics_of
 from poet_loc.io.frames_csv import Frames
 from poet_loc.io.input_text import read_json
@@ -70,6 +71,8 @@ class ConvertRosbagOptions:
     """Odometry of the camera: T_odom_cam.tum. Never guessed."""
     images: str | None = None
     """CompressedImage or Image: their stamps become frames.csv."""
+    extract_images: bool = False
+    """Write the images too, to images/ of the log: compressed ones as they are, raw ones as PNG."""
     classes: Path | None = None
     """{"1": "box", ..}: the object id of each class name; without it names are looked up in the map of --like."""
     typestore: str | None = None
@@ -109,15 +112,15 @@ def convert_rosbag(
     Raises InputError for a topic that is missing, of the wrong type or ambiguous, and for what readers of logs refuse.
     """
     options = options or ConvertRosbagOptions()
-    with open_bag(bag, options.typestore) as reader:
-        topics = topics_of(reader)
-        chosen = choose_topics(topics, options, Path(bag))
-        columns = _read(reader, chosen, progress)
     like = Log(Path(out)) if options.like is None else read_log_files(options.like)
-    log, dropped = _log_of(columns, chosen, replace(like, path=Path(out)), options)
-    check_log(log)
     inputs = [path for path in (bag, options.classes, options.like) if path is not None]
     with whole_folder(out, options.overwrite, inputs) as folder:
+        with open_bag(bag, options.typestore) as reader:
+            topics = topics_of(reader)
+            chosen = choose_topics(topics, options, Path(bag))
+            columns = _read(reader, chosen, folder if options.extract_images else None, progress)
+        log, dropped = _log_of(columns, chosen, replace(like, path=Path(out)), options)
+        check_log(log)
         write_log(folder, log)
     used = {topic.split(":")[0] for topic in chosen.values()}
     unused = tuple(topic for topic in topics if topic.name not in used)
@@ -158,7 +161,9 @@ def choose_topics(topics: list[BagTopic], options: ConvertRosbagOptions, bag: Pa
     return chosen
 
 
-def _read(reader: Any, chosen: Mapping[str, str], progress: Progress | None) -> dict[str, _Columns]:
+def _read(
+    reader: Any, chosen: Mapping[str, str], images_to: Path | None, progress: Progress | None
+) -> dict[str, _Columns]:
     columns = {role: _Columns() for role in chosen}
     by_topic: dict[str, list[str]] = {}
     for role, topic in chosen.items():
@@ -169,6 +174,10 @@ def _read(reader: Any, chosen: Mapping[str, str], progress: Progress | None) -> 
         message = reader.deserialize(data, connection.msgtype)
         for role in by_topic[connection.topic]:
             _take(role, message, connection.msgtype.replace("/msg/", "/"), chosen[role], columns[role])
+            if role == "images":
+                number = len(columns[role].stamps) - 1
+                name = f"{chosen[role]}#{number}" if images_to is None else write_image(images_to, number, message)
+                columns[role].names.append(name)
         if progress is not None and count % _EVERY == 0:
             progress(count, total)
     if progress is not None:
@@ -255,8 +264,7 @@ def _log_of(
         if role == "imu":
             log = replace(log, imu=ImuSamples(stamps, numbers[:, :3], numbers[:, 3:]))
         elif role == "images":
-            images = tuple(f"{chosen[role]}#{frame}" for frame in frames.tolist())
-            log = replace(log, frames=Frames(stamps, frames, images))
+            log = replace(log, frames=Frames(stamps, frames, tuple(read.names[row] for row in keep)))
         elif role == "detections":
             ids = _object_ids([read.names[row] for row in keep], log, options.classes)
             poses = ObjectPoses(

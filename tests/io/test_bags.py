@@ -255,3 +255,24 @@ def test_rerun_opens_our_mcap(tmp_path) -> None:
         [rerun, "rrd", "stats", "out.rrd"], cwd=tmp_path, capture_output=True, text=True, timeout=120
     )
     assert verified.returncode == 0, verified.stderr
+
+
+def test_raw_and_compressed_images_are_written(tmp_path) -> None:
+    cv2 = pytest.importorskip("cv2")
+    from rosbags.rosbag2 import Writer
+
+    messages, pixels = Messages("ros2_humble"), rng.integers(0, 255, (4, 5, 3), dtype=np.uint8)
+    padded = np.concatenate([pixels.reshape(4, 15), np.zeros((4, 2), np.uint8)], axis=1)
+    encoded = cv2.imencode(".png", pixels[:, :, ::-1])[1].ravel()
+    header = messages.header(START, "cam")
+    for name, message in (
+        ("sensor_msgs/msg/Image", messages.types["sensor_msgs/msg/Image"](header, 4, 5, "rgb8", 0, 17, padded.ravel())),
+        ("sensor_msgs/msg/CompressedImage", messages.types["sensor_msgs/msg/CompressedImage"](header, "png", encoded)),
+    ):
+        bag = tmp_path / name.split("/")[-1]
+        with Writer(bag, version=9) as writer:
+            connection = writer.add_connection("/image", name, typestore=messages.store)
+            writer.write(connection, START, messages.store.serialize_cdr(message, name))
+        log = convert_rosbag(bag, tmp_path / f"{bag.name}_log", ConvertRosbagOptions(extract_images=True)).log
+        written = cv2.imread(str(tmp_path / f"{bag.name}_log" / log.frames.images[0]))
+        np.testing.assert_array_equal(written[:, :, ::-1], pixels)
