@@ -23,7 +23,7 @@ Array = NDArray[np.float64]
 _TILT_DEG, _TILT_OF_ONE_DEG = 25.0, 60.0
 _MOST_FRAMES = 400
 _DYNAMICS_S = 0.6
-_ANSWER = 0.15
+_ANSWER = 0.3
 
 
 def check_gravity(log: Log) -> Iterator[Finding]:
@@ -138,8 +138,8 @@ def _answer_to_motion(imu: ImuSamples, body: Trajectory) -> float:
         return 0.0
     poses, valid = body.interpolate(stamps, int(4 * step))
     force = poses.rotation.apply(_force_at(imu, stamps, step / 1e9))
-    acceleration = _second_derivative(poses.translation, window, step / 1e9)
-    smooth = np.ones(window) / window
+    kernel, smooth = _matched_kernels(window, step / 1e9)
+    acceleration = np.column_stack([np.correlate(column, kernel, "valid") for column in poses.translation.T])
     turned_bias = poses.rotation.as_matrix().reshape(-1, 9)
     force, turned_bias = (
         np.column_stack([np.convolve(column, smooth, "valid") for column in each.T]) for each in (force, turned_bias)
@@ -158,11 +158,15 @@ def _regressed(acceleration: Array, force: Array, rotations: Array) -> float:
     return float(solution[0])
 
 
-def _second_derivative(positions: Array, window: int, step_s: float) -> Array:
-    """Return it from a parabola through each window of positions, (N - window + 1, 3)."""
+def _matched_kernels(window: int, step_s: float) -> tuple[Array, Array]:
+    """Return the second derivative of a parabola through a window of positions, and the mean of accelerations it is.
+
+    By parts, sum k_i p_i = sum K_j (p_{j-1} - 2 p_j + p_{j+1}) with K the double running sum of k.
+    """
     t = (np.arange(window) - window // 2) * step_s
     kernel = 2.0 * np.linalg.pinv(np.vander(t, 3))[0]
-    return np.column_stack([np.correlate(column, kernel, "valid") for column in positions.T])
+    twice = np.cumsum(np.cumsum(kernel))[:-2] * step_s**2
+    return kernel, np.concatenate([[0.0], twice, [0.0]])
 
 
 def _world_file(log: Log) -> str:

@@ -29,6 +29,7 @@ _MOST_ROWS = 1500
 _FITS_DEG, _MISFITS_DEG = 15.0, 40.0
 _OUT_OF_PLACE_M, _OUT_OF_PLACE_DEG = 0.08, 15.0
 _TIMES_OTHERS = 3.0
+_STEADY = 2.0  # offset over its own scatter
 _TRUTH_APART_M, _TRUTH_APART_DEG = 0.5, 30.0
 
 
@@ -104,6 +105,9 @@ class _Residual:
 
     offset_m: float
     turn_deg: float
+    spread_m: float
+    """Robust scatter of the offset: a landmark that is out of place is so steadily, a wrong detector is not."""
+    spread_deg: float
     seen: int
     share_voting: float
 
@@ -128,6 +132,7 @@ def check_landmarks(log: Log) -> Iterator[Finding]:
             "others_median_offset_m": float(np.median([each.offset_m for each in others])),
             "others_median_turn_deg": float(np.median([each.turn_deg for each in others])),
             "detections": mine.seen,
+            "offset_scatter_m": mine.spread_m,
             "share_that_votes": mine.share_voting,
             "sets_that_say_so": len(seen),
         }
@@ -223,13 +228,18 @@ def _residuals(poses: ObjectPoses, landmark_map: LandmarkMap) -> dict[int, _Resi
         rotations = Rotation.from_matrix(association.R_cam_obj[mine])
         T = cameras * RigidTransform.from_components(rows.T_cam_obj[mine].translation, rotations)
         T_map = landmark_map.landmarks[index].T_world_obj
-        offset = np.median(T.translation - T_map.translation, axis=0)
-        turn = np.median((T_map.rotation.inv() * T.rotation).as_rotvec(), axis=0)
+        offset, spread_m = _middle(T.translation - T_map.translation)
+        turn, spread = _middle((T_map.rotation.inv() * T.rotation).as_rotvec())
         voting = float(solution.voted[mine].mean())
-        result[index] = _Residual(
-            float(np.linalg.norm(offset)), float(np.degrees(np.linalg.norm(turn))), len(mine), voting
-        )
+        result[index] = _Residual(offset, np.degrees(turn), spread_m, np.degrees(spread), len(mine), voting)
     return result
+
+
+def _middle(vectors: Array) -> tuple[float, float]:
+    """Return the length of the median vector, and the robust scatter about it."""
+    middle = np.median(vectors, axis=0)
+    scatter = 1.48 * float(np.median(np.linalg.norm(vectors - middle, axis=1)))
+    return float(np.linalg.norm(middle)), scatter
 
 
 def _out_of_line(table: dict[int, _Residual], index: int) -> bool:
@@ -238,7 +248,9 @@ def _out_of_line(table: dict[int, _Residual], index: int) -> bool:
     turned = mine.turn_deg > max(
         _OUT_OF_PLACE_DEG, _TIMES_OTHERS * float(np.median([each.turn_deg for each in others]))
     )
-    return (far or turned) and mine.share_voting < 0.5
+    steady = far and mine.offset_m > _STEADY * mine.spread_m
+    steady |= turned and mine.turn_deg > _STEADY * mine.spread_deg
+    return steady and mine.share_voting < 0.5
 
 
 def _gap(T_world_cam: Trajectory, truth: Trajectory, reading: Reading) -> tuple[float, float] | None:
