@@ -96,7 +96,10 @@ from fusion.tape import (
 )
 
 # Places in the limits.
-LIMIT_BOTH, LIMIT_ROTATION, LIMIT_POSITION, PARTIAL, NOMINAL_OFFSET, ADAPTATION, MAX_SCALE, JUMP_AFTER = range(8)
+LIMIT_BOTH, LIMIT_ROTATION, LIMIT_POSITION, PARTIAL, NOMINAL_OFFSET, ADAPTATION, MAX_SCALE, JUMP_AFTER, SETTLED = range(
+    9
+)
+PENDING = -1  # beside the decisions of the gate
 
 OUT_CORE, OUT_SIGMA, OUT_COVARIANCE = 21, 15, 36
 
@@ -216,13 +219,18 @@ def measure(
         c[BIAS_TIME] = c[NOW]
     accepted = False
     for j in range(first, last):
-        decisions[j] = REJECTED
-    for again in range(2 if c[MODE] == TRACKING else 0):  # what was refused before the others moved the state, again
-        for j in range(first, last if accepted or again == 0 else first):
-            if decisions[j] == REJECTED:
+        decisions[j] = PENDING if c[MODE] == TRACKING else REJECTED
+    if c[MODE] == TRACKING:
+        _order(m, w, first, last, kinds, objects, rotations, translations, covariances, rate, nis)
+        for _ in range(first, last):
+            j = _next(first, last, decisions, nis)
+            k, R_m, t_m = objects[j], rotations[j], translations[j]
+            decisions[j] = _update(m, w, kinds[j], k, R_m, t_m, covariances[j], rate, nis[j], True)
+            accepted = accepted or decisions[j] != REJECTED
+        for j in range(first, last if accepted else first):
+            if decisions[j] == REJECTED:  # refused before the others had moved the state: ask again
                 k, R_m, t_m = objects[j], rotations[j], translations[j]
-                decisions[j] = _update(m, w, kinds[j], k, R_m, t_m, covariances[j], rate, nis[j])
-                accepted = accepted or decisions[j] != REJECTED
+                decisions[j] = _update(m, w, kinds[j], k, R_m, t_m, covariances[j], rate, nis[j], True)
     for j in range(first, last):
         _follow_jumps(m, kinds[j], objects[j], decisions[j])
         _vote(m, w, kinds[j], objects[j], rotations[j], translations[j], decisions[j])
@@ -232,6 +240,43 @@ def measure(
         _try_to_start(m, w)
     else:
         _restart_if_lost(m, w)
+
+
+@njit(cache=True)
+def _order(
+    m: Memory,
+    w: Work,
+    first: int,
+    last: int,
+    kinds: Ints,
+    objects: Ints,
+    rotations: Array,
+    translations: Array,
+    covariances: Array,
+    rate: Array,
+    nis: Array,
+) -> None:
+    """Write into nis[:, 0] what measurements of one stamp are taken in by, the least first.
+
+    A state that is sure of itself takes them as they come. One that is not lets those that fit it best speak first:
+    its gate is wide, and a gross error that came first would shut the others out.
+    """
+    unsettled = m.P[3, 3] + m.P[4, 4] + m.P[5, 5] > m.limits[SETTLED]
+    for j in range(first, last):
+        if unsettled:
+            _update(m, w, kinds[j], objects[j], rotations[j], translations[j], covariances[j], rate, nis[j], False)
+        else:
+            nis[j, 0] = j
+
+
+@njit(cache=True)
+def _next(first: int, last: int, decisions: Ints, nis: Array) -> int:
+    """Return the pending measurement with the least nis."""
+    best = -1
+    for j in range(first, last):
+        if decisions[j] == PENDING and (best < 0 or nis[j, 0] < nis[best, 0]):
+            best = j
+    return best
 
 
 @njit(cache=True)
@@ -245,7 +290,9 @@ def _update(
     covariance: Array,
     rate: Array,
     nis: Array,
+    correcting: bool,
 ) -> int:
+    """Gate a measurement and, where correcting, take in what passes; write its NIS (3,), return what passed."""
     n = m.layout[N_ERROR]
     R_m, t_m = w.measured[0:9], w.measured[9:12]
     for i in range(9):
@@ -257,7 +304,8 @@ def _update(
         for j in range(6):
             w.R[i, j] = covariance[i, j] * scale
     if kind == OBJECT_POSE and m.known[k] == 0.0:
-        return _meet_object(m, w, k, R_m, t_m, rate)
+        nis[0] = np.inf
+        return _meet_object(m, w, k, R_m, t_m, rate) if correcting else REJECTED
     if kind == OBJECT_POSE and m.orders[k] != 1:
         _fit_object_symmetry(m, w, k, R_m, rate)
     count = residual_and_jacobian(
@@ -265,6 +313,8 @@ def _update(
     )
     innovation(m.P, w.H, m.columns, count, w.R, n, w.PHt, w.S)
     decision = gate(w.S, w.residual, m.limits, m.limits[PARTIAL], w.L, w.white, nis)
+    if not correcting:
+        return decision
     if kind == OBJECT_POSE and m.limits[ADAPTATION] > 0.0:
         _adapt_scale(m, k, nis[0])
     if decision != REJECTED:

@@ -185,7 +185,7 @@ def fill_memory(problem: Problem, options: FuseOptions) -> tuple[Array, NDArray[
         options.gap.angular_rate,
         options.gap.acceleration,
     )
-    m.limits[: filter_loop.JUMP_AFTER + 1] = _limits(options)
+    m.limits[: filter_loop.SETTLED + 1] = _limits(options)
     m.start[: consensus.MIN_SHARE + 1] = _start(options)
     bias = options.bias
     m.bias_model[:] = 0.0
@@ -265,6 +265,7 @@ def _limits(options: FuseOptions) -> list[float]:
         gate.adaptation,
         gate.max_noise_scale,
         options.bias.jump_after,
+        3.0 * gate.settled**2,
     ]
 
 

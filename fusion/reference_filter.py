@@ -172,7 +172,7 @@ class ReferenceFilter:
             return ROTATION_ONLY
         return REJECTED
 
-    def take(self, measured: Columns, j: int, rate: Array, nis: Array) -> int:
+    def take(self, measured: Columns, j: int, rate: Array, nis: Array, correcting: bool = True) -> int:
         """Gate measurement j, which is at the filter's stamp, correct with what passes, and return what that was."""
         kinds, objects, rotations, translations, covariances = measured
         kind, k, t_m = int(kinds[j]), int(objects[j]), translations[j]
@@ -180,12 +180,15 @@ class ReferenceFilter:
         if kind == OBJECT_POSE:
             R = R * m.scales[k]
             if not m.known[k]:
-                return self._meet_object(k, R_m, t_m, R, rate)
+                nis[0] = np.inf
+                return self._meet_object(k, R_m, t_m, R, rate) if correcting else REJECTED
             if m.orders[k] != 1:
                 R_m, R = self._fit_symmetry(k, R_m, R, rate)
         offset = m.limits[filter_loop.NOMINAL_OFFSET]
         residual, H = residual_and_jacobian(kind, k, R_m, t_m, m.x, rate, offset, self.layout)
         decision = self.gate(residual, H @ m.P @ H.T + R, nis)
+        if not correcting:
+            return decision
         if kind == OBJECT_POSE and m.limits[filter_loop.ADAPTATION] > 0.0:
             filter_loop._adapt_scale(m, k, nis[0])
         if decision != REJECTED:
@@ -239,18 +242,26 @@ class ReferenceFilter:
             R[:3, :3] += 1e3 * np.outer(R_m @ axis, R_m @ axis)
         return R_m, R
 
+    def order(self, first: int, last: int, measured: Columns, rate: Array, nis: Array) -> list[int]:
+        """Return the order in which a stamp is taken in: an unsure state hears the best fit first."""
+        order = list(range(first, last))
+        if np.trace(self.m.P[POS, POS]) <= self.m.limits[filter_loop.SETTLED]:
+            return order
+        for j in order:
+            self.take(measured, j, rate, nis[j], correcting=False)
+        return sorted(order, key=lambda j: float(nis[j, 0]))
+
     def measure(self, first: int, last: int, measured: Columns, rate: Array, decisions: Ints, nis: Array) -> None:
         """Take in all measurements of one stamp, then see whether to start or to start again."""
         m, c, (kinds, objects, rotations, translations, _) = self.m, self.m.counters, measured
         decisions[first:last] = REJECTED
         if self.tracking:
             self.decay_biases()
-            for _ in range(2):  # what was refused before the others moved the state, again
-                for j in range(first, last):
-                    if decisions[j] == REJECTED:
-                        decisions[j] = self.take(measured, j, rate, nis[j])
-                if not decisions[first:last].any():
-                    break
+            for j in self.order(first, last, measured, rate, nis):
+                decisions[j] = self.take(measured, j, rate, nis[j])
+            for j in range(first, last if decisions[first:last].any() else first):
+                if decisions[j] == REJECTED:  # refused before the others had moved the state: ask again
+                    decisions[j] = self.take(measured, j, rate, nis[j])
         for j in range(first, last):
             filter_loop._follow_jumps(m, kinds[j], objects[j], decisions[j])
             filter_loop._vote(m, self.work, kinds[j], objects[j], rotations[j], translations[j], decisions[j])
