@@ -15,4 +15,6 @@ COMMANDS = {
     "to-evo": "the errors of a trajectory become a result zip for evo_res",
     "to-kitti": "a trajectory becomes KITTI poses",
     "to-euroc": "a trajectory becomes a csv file as EuRoC's ground truth",
+    "checkpoint": "an official PoET checkpoint becomes a safetensors file, safely",
+    "classes": "class and symmetry files of YCB-V or LM-O",
 }
