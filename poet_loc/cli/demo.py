@@ -6,8 +6,10 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from fusion.simulate import SimulationOptions, simulate
-from poet_loc.cli.estimates import StageOptions
-from poet_loc.cli.run import run_stages, show
+from poet_loc.cli.estimates import StageOptions, estimate_log, refuse_one_estimator, steps
+from poet_loc.cli.run import show
+from poet_loc.cli.run_folder import WRITING_STEPS, write_run
+from poet_loc.cli.terminal import progress
 from poet_loc.io.log_folder import write_log
 from poet_loc.io.whole_folder import whole_folder
 
@@ -29,11 +31,14 @@ class Arguments:
 
 def execute(arguments: Arguments) -> None:
     """Simulate, run all stages, print the tables and name the files."""
-    with whole_folder(arguments.out, arguments.overwrite) as folder:
+    refuse_one_estimator(arguments.options.fusion)
+    with whole_folder(arguments.out, arguments.overwrite) as folder, progress(1 + steps() + WRITING_STEPS) as report:
+        report.step("simulate")
         log = replace(simulate(SimulationOptions(seed=arguments.seed)), path=arguments.out / "log")
         (folder / "log").mkdir()
         write_log(folder / "log", log)
+        estimates = estimate_log(log, None, arguments.options, report)
         (folder / "run").mkdir()
-        estimates = run_stages(log, None, arguments.options, folder / "run", arguments, arguments.pictures)
+        write_run(folder / "run", estimates, arguments, report, arguments.pictures)
     show(estimates, arguments.out / "run")
     print(f"\nThe log: {arguments.out / 'log'}\nLook at it: poet-loc view {arguments.out / 'run'}")

@@ -12,14 +12,25 @@ from landmarks.localize import LocalizeOptions, LocalizeResult, localize
 from landmarks.options import MODES, ORACLES, Mode, SolverOptions
 from poet_loc.cli.terminal import Report
 from poet_loc.core.input_error import InputError
+from poet_loc.core.records import CameraPoses
 from poet_loc.io.log_folder import Log
 from poet_loc.report.evaluate import Estimate, EvaluateOptions, Evaluation
 from poet_loc.report.log_evaluation import evaluate_log, references_of
 from poet_loc.report.run_record import RunRecord
 
-Fusion = tuple[Literal["eskf", "graph", "batch"], Literal["camera", "objects"]]
+Fusion = Literal[
+    "eskf/objects",
+    "eskf/camera",
+    "eskf-smoothed/objects",
+    "eskf-smoothed/camera",
+    "graph/objects",
+    "graph/camera",
+    "batch/objects",
+    "batch/camera",
+]
+"""<estimator>/<measurements>, as in the name of the estimate."""
 
-FUSIONS: tuple[Fusion, ...] = (("eskf", "objects"), ("eskf", "camera"))
+FUSIONS: tuple[Fusion, ...] = ("eskf/objects", "eskf/camera", "graph/objects")
 
 
 @dataclass(frozen=True)
@@ -157,20 +168,54 @@ def _fused(
 ) -> Iterator[FuseResult]:
     from fusion.fuse import fuse
 
-    solved = {result.name: result.estimates for result in localized}.get(f"localize/{options.solver.mode}")
-    # the log's own camera poses come first; of the solver's, those that only repeat an earlier one bring nothing
-    from_solver = solved.camera_poses[~solved.held] if solved is not None and log.camera_poses is None else None
+    wanted = any(with_fusion(options.fusion, fusion).measurements == "camera" for fusion in fusions)
+    from_solver = _solved(log, detections, localized, options.solver, attempt) if wanted else None
     object_poses = None if detections is None else log.object_poses[detections]
     there = {"objects": object_poses is not None, "camera": log.camera_poses is not None or from_solver is not None}
-    for estimator, measurements in fusions:
-        if not there[measurements] and not attempt.strict:
+    for fusion in fusions:
+        choice = with_fusion(options.fusion, fusion)
+        if not there[choice.measurements] and not attempt.strict:
             continue
-        attempt.report.step(f"fuse {estimator} {measurements}")
-        choice = replace(options.fusion, estimator=estimator, measurements=measurements)
+        attempt.report.step(f"fuse {fusion}")
         try:
             yield fuse(log, choice, camera_poses=from_solver, object_poses=object_poses)
         except InputError as error:
-            attempt.failed(error, f"fuse/{estimator}/{measurements}")
+            attempt.failed(error, f"fuse/{fusion}")
+
+
+def _solved(
+    log: Log, detections: str | None, localized: Sequence[LocalizeResult], options: SolverOptions, attempt: _Attempt
+) -> CameraPoses | None:
+    """Return the camera poses of the solver's mode; None where the log brings its own or there is nothing to solve."""
+    if log.camera_poses is not None or detections is None:
+        return None
+    among = [result for result in localized if result.name == f"localize/{options.mode}"]
+    found = next(iter(among or _localized(log, detections, options, attempt, [options.mode])), None)
+    # poses that only repeat an earlier one bring nothing
+    return None if found is None else found.estimates.camera_poses[~found.estimates.held]
+
+
+def with_fusion(options: FuseOptions, fusion: Fusion) -> FuseOptions:
+    """Return the options with the estimator and the measurements that a name says."""
+    estimator, measurements = fusion.split("/")
+    return replace(
+        options,
+        estimator=estimator.removesuffix("-smoothed"),  # type: ignore[arg-type]
+        smooth=estimator.endswith("-smoothed"),
+        measurements=measurements,  # type: ignore[arg-type]
+    )
+
+
+def fusion_of(options: FuseOptions) -> Fusion:
+    """Return the name of what the options ask for."""
+    smoothed = "-smoothed" if options.smooth else ""
+    return f"{options.estimator}{smoothed}/{options.measurements}"  # type: ignore[return-value]
+
+
+def refuse_one_estimator(options: FuseOptions) -> None:
+    """Raise InputError where the options name an estimator although the command takes several."""
+    if fusion_of(options) != fusion_of(FuseOptions()):
+        raise InputError(f"several estimators run here, not {fusion_of(options)} alone", fix="name them with --fusions")
 
 
 def _localize_options(options: SolverOptions, mode: Mode, detections: str | None) -> LocalizeOptions:

@@ -8,7 +8,7 @@ from pathlib import Path
 from fusion.options import FuseOptions
 from landmarks.options import Mode, SolverOptions
 from poet_loc.cli.arguments import Flat, LogFolder
-from poet_loc.cli.estimates import StageOptions, estimate_log, steps
+from poet_loc.cli.estimates import StageOptions, estimate_log, fusion_of, steps
 from poet_loc.cli.noise_file import with_noise_from
 from poet_loc.cli.run import show
 from poet_loc.cli.run_folder import WRITING_STEPS, write_run
@@ -46,7 +46,7 @@ def execute(arguments: Arguments) -> None:
         log = read_log(arguments.log, arguments.detections)
         solve = options.measurements == "camera" and log.camera_poses is None
         modes = (arguments.mode,) if solve else ()
-        fusions = ((options.estimator, options.measurements),)
+        fusions = (fusion_of(options),)
         with progress(steps(modes, fusions) + WRITING_STEPS) as report:
             estimates = estimate_log(log, arguments.detections, stages, report, modes, fusions, strict=True)
             write_run(folder, estimates, arguments, report, arguments.pictures)

@@ -11,8 +11,9 @@ import numpy as np
 
 from fusion.monte_carlo import simulate_runs
 from fusion.simulate import SimulationOptions, simulate
+from landmarks.options import Mode
 from poet_loc.cli.arguments import Flat
-from poet_loc.cli.estimates import FUSIONS, StageOptions, estimate_log
+from poet_loc.cli.estimates import FUSIONS, Fusion, StageOptions, estimate_log, refuse_one_estimator
 from poet_loc.cli.terminal import Silent, print_tables
 from poet_loc.core.input_error import InputError
 from poet_loc.io.log_folder import write_log
@@ -31,6 +32,10 @@ class Arguments:
     """Write the simulated log to this folder."""
     runs: int = 0
     """Localise and fuse so many logs, with seeds from --seed on, and print their errors."""
+    modes: tuple[Mode, ...] = ("prev", "best", "robust")
+    """Modes of the solver in those runs."""
+    fusions: tuple[Fusion, ...] = FUSIONS
+    """Estimators and what they fuse in those runs."""
     workers: int = -1
     """Processes that share the runs; -1: one per core."""
     cluster: str | None = None
@@ -43,6 +48,7 @@ class Arguments:
 
 def execute(arguments: Arguments) -> None:
     """Write the log, print the table of the runs, or both."""
+    refuse_one_estimator(arguments.options.fusion)
     if arguments.out is None and arguments.runs < 1:
         raise InputError("nothing to do", fix="give --out LOG, --runs N, or both")
     if arguments.out is not None:
@@ -53,12 +59,12 @@ def execute(arguments: Arguments) -> None:
         print_tables([runs_table(_summaries(arguments))])
 
 
-def summary_of_run(seed: int, simulation: SimulationOptions, options: StageOptions) -> Summary:
+def summary_of_run(seed: int, arguments: Arguments) -> Summary:
     """Return the summary of one simulated log; an estimator that never started is not in it."""
-    log = simulate(replace(simulation, seed=seed))
-    evaluation = estimate_log(log, None, options, Silent(), ("prev", "best", options.solver.mode), FUSIONS).evaluation
-    assert evaluation is not None
-    return to_summary(evaluation)
+    log = simulate(replace(arguments.simulation, seed=seed))
+    estimates = estimate_log(log, None, arguments.options, Silent(), arguments.modes, arguments.fusions)
+    assert estimates.evaluation is not None
+    return to_summary(estimates.evaluation)
 
 
 def runs_table(summaries: Sequence[Summary]) -> Table:
@@ -91,7 +97,7 @@ def _row(name: str, summaries: Sequence[RowSummary]) -> Iterator[str]:
 
 def _summaries(arguments: Arguments) -> list[Summary]:
     first = arguments.simulation.seed
-    function = partial(summary_of_run, simulation=arguments.simulation, options=arguments.options)
+    function = partial(summary_of_run, arguments=arguments)
     seeds = range(first, first + arguments.runs)
     if arguments.cluster is None:
         return simulate_runs(function, seeds, arguments.workers)

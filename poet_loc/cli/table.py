@@ -13,7 +13,7 @@ import tyro
 
 from landmarks.options import MODES, Mode
 from poet_loc.cli.arguments import Flat
-from poet_loc.cli.estimates import FUSIONS, StageOptions, estimate_log, steps
+from poet_loc.cli.estimates import FUSIONS, Fusion, StageOptions, estimate_log, refuse_one_estimator, steps
 from poet_loc.cli.sensitivity_table import sensitivity_rows, sensitivity_tables, sensitivity_text
 from poet_loc.cli.terminal import Report, print_tables, progress
 from poet_loc.core.input_error import InputError
@@ -39,7 +39,9 @@ class Arguments:
     modes: tuple[Mode, ...] = MODES
     """Modes of the solver, one row each."""
     with_fusion: bool = False
-    """Also fuse, and add a row for each estimator."""
+    """Also fuse, and add a row for each of --fusions."""
+    fusions: tuple[Fusion, ...] = FUSIONS
+    """Estimators and what they fuse."""
     sensitivity: bool = False
     """Instead: how the errors of the modes depend on the solver's options, one changed at a time."""
     pooled_only: bool = False
@@ -57,6 +59,7 @@ def execute(arguments: Arguments) -> None:
     """Compute the table and print or write it."""
     if not arguments.logs:
         raise InputError("no log was named", fix="poet-loc table LOG [LOG ..]")
+    refuse_one_estimator(arguments.options.fusion)
     form = _form(arguments)
     logs = [read_log(path) for path in arguments.logs]
     if arguments.sensitivity:
@@ -89,7 +92,7 @@ def _form(arguments: Arguments) -> Format:
 def _blocks(logs: Sequence[Log], arguments: Arguments) -> list[Block]:
     labels = log_labels(arguments.logs)
     sets = detection_sets(logs, arguments.detections)
-    fusions = FUSIONS if arguments.with_fusion else ()
+    fusions = arguments.fusions if arguments.with_fusion else ()
     jobs = [(log, label, name) for name in sets for log, label in zip(logs, labels, strict=True) if _has(log, name)]
     found: dict[str | None, list[tuple[str, Evaluation]]] = {name: [] for name in sets}
     with progress(len(jobs) * steps(arguments.modes, fusions)) as report:

@@ -79,8 +79,9 @@ def test_the_top_of_a_run_is_robust_and_the_filter_on_objects(run):
 
 def test_a_runs_summary_names_every_estimate_and_the_filter_is_good(run):
     rows = summary(run)
-    assert {f"localize/{mode}" for mode in MODES} | {"fuse/eskf/objects", "fuse/eskf/camera"} <= rows.keys()
-    assert rmse_mm(rows["fuse/eskf/objects"]) < rmse_mm(rows["localize/prev"])
+    fused = {"fuse/eskf/objects", "fuse/eskf/camera", "fuse/graph/objects"}
+    assert {f"localize/{mode}" for mode in MODES} | fused <= rows.keys()
+    assert all(rmse_mm(rows[name]) < rmse_mm(rows["localize/prev"]) for name in fused)
     assert rows["localize/best"]["oracle"]
     assert rows["fuse/eskf/objects"]["coverage"] > 0.9
 
@@ -314,3 +315,17 @@ def test_the_program_itself_in_a_pipe(clean_log, tmp_path):
     assert done.stderr == ""
     assert done.stdout.startswith("**Errors on the common frames**")
     assert str(tmp_path / "run" / "summary.json") in done.stdout
+
+
+def test_fusions_are_chosen_by_name(clean_log, tmp_path, capsys):
+    asked = ["table", str(clean_log), "--modes", "best", "--with-fusion", "--format", "json"]
+    assert main([*asked, "--fusions", "eskf-smoothed/objects", "eskf/camera"]) == 0
+    rows = json.loads(capsys.readouterr().out)
+    assert {row["name"] for row in rows} == {"localize/best", "fuse/eskf-smoothed/objects", "fuse/eskf/camera"}
+
+
+@pytest.mark.parametrize("command", [["run", "LOG", "--out", "RUN"], ["table", "LOG"]])
+def test_one_estimator_is_refused_where_several_run(command, clean_log, tmp_path, capsys):
+    paths = {"LOG": str(clean_log), "RUN": str(tmp_path / "run")}
+    assert main([*(paths.get(word, word) for word in command), "--fusion.estimator", "graph"]) == 1
+    assert "--fusions" in capsys.readouterr().err
