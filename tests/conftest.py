@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
+from headless_browser import NAMES, Browser, find_browser
 
 REPOSITORY = Path(__file__).resolve().parents[1]
 SHARED = REPOSITORY.parent / "shared"
@@ -27,3 +28,12 @@ def shared_data() -> Path:
 def shared_fixtures() -> Path:
     """Folder with poet_official/."""
     return _shared_folder("fixtures")
+
+
+@pytest.fixture(scope="session")
+def browser(tmp_path_factory: pytest.TempPathFactory) -> Browser:
+    """Chromium without a window."""
+    found = find_browser(tmp_path_factory.mktemp("browser"))
+    if found is None:
+        pytest.skip(f"no browser is installed: none of {', '.join(NAMES)}")
+    return found

@@ -182,7 +182,7 @@ def test_html_tables_escape_and_mark():
     assert "a &lt; b" in html
     assert "&lt;i&gt;" in html
     assert "<b>1 &amp; 2</b>" in html
-    assert "x [mm]" in html
+    assert "g [mm]" in html
     page_sources(html)
 
 

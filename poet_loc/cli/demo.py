@@ -24,6 +24,8 @@ class Arguments:
     """Another seed is another world."""
     pictures: bool = True
     """Draw the figures and write the recording for rerun."""
+    paper: bool = False
+    """Write the figures as vector PDF, too: 8 pt, as wide as two columns of a paper."""
     overwrite: bool = False
     """Replace a folder that has results."""
     options: StageOptions = field(default_factory=StageOptions)
@@ -39,6 +41,6 @@ def execute(arguments: Arguments) -> None:
         write_log(folder / "log", log)
         estimates = estimate_log(log, None, arguments.options, report)
         (folder / "run").mkdir()
-        write_run(folder / "run", estimates, arguments, report, arguments.pictures)
+        write_run(folder / "run", estimates, arguments, report, arguments.pictures, arguments.paper)
     show(estimates, arguments.out / "run")
     print(f"\nThe log: {arguments.out / 'log'}\nLook at it: poet-loc view {arguments.out / 'run'}")

@@ -34,6 +34,8 @@ class Arguments:
     """Noise and bias of the detections from this file, as fit-noise writes it."""
     pictures: bool = True
     """Draw the figures and write the recording for rerun."""
+    paper: bool = False
+    """Write the figures as vector PDF, too: 8 pt, as wide as two columns of a paper."""
     overwrite: bool = False
     """Replace a run folder that has results."""
 
@@ -49,5 +51,5 @@ def execute(arguments: Arguments) -> None:
         fusions = (fusion_of(options),)
         with progress(steps(modes, fusions) + WRITING_STEPS) as report:
             estimates = estimate_log(log, arguments.detections, stages, report, modes, fusions, strict=True)
-            write_run(folder, estimates, arguments, report, arguments.pictures)
+            write_run(folder, estimates, arguments, report, arguments.pictures, arguments.paper)
     show(estimates, arguments.out)

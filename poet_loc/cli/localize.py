@@ -26,6 +26,8 @@ class Arguments:
     options: Flat[LocalizeOptions] = field(default_factory=LocalizeOptions)
     pictures: bool = True
     """Draw the figures and write the recording for rerun."""
+    paper: bool = False
+    """Write the figures as vector PDF, too: 8 pt, as wide as two columns of a paper."""
     overwrite: bool = False
     """Replace a run folder that has results."""
 
@@ -39,5 +41,5 @@ def execute(arguments: Arguments) -> None:
         with progress(steps((options.mode,), ()) + WRITING_STEPS) as report:
             stages = StageOptions(solver=options)
             estimates = estimate_log(log, options.detections, stages, report, (options.mode,), (), strict=True)
-            write_run(folder, estimates, arguments, report, arguments.pictures)
+            write_run(folder, estimates, arguments, report, arguments.pictures, arguments.paper)
     show(estimates, arguments.out)

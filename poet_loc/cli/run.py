@@ -33,6 +33,8 @@ class Arguments:
     """Noise and bias of the detections from this file, as fit-noise writes it."""
     pictures: bool = True
     """Draw the figures and write the recording for rerun."""
+    paper: bool = False
+    """Write the figures as vector PDF, too: 8 pt, as wide as two columns of a paper."""
     overwrite: bool = False
     """Replace a run folder that has results."""
     options: Flat[StageOptions] = field(default_factory=StageOptions)
@@ -47,7 +49,7 @@ def execute(arguments: Arguments) -> None:
         stages = replace(arguments.options, fusion=fusion)
         with progress(steps(MODES, arguments.fusions) + WRITING_STEPS) as report:
             estimates = estimate_log(log, arguments.detections, stages, report, MODES, arguments.fusions)
-            write_run(folder, estimates, arguments, report, arguments.pictures)
+            write_run(folder, estimates, arguments, report, arguments.pictures, arguments.paper)
     show(estimates, arguments.out)
 
 

@@ -31,10 +31,13 @@ _AT_THE_TOP = ("localize/robust", "fuse/eskf/objects")
 _PACKAGES = ("poet-loc", "numpy", "scipy", "numba", "gtsam", "rerun-sdk", "matplotlib")
 
 
-def write_run(folder: Path, estimates: Estimates, asked: Any, report: Report, pictures: bool = True) -> None:
+def write_run(
+    folder: Path, estimates: Estimates, asked: Any, report: Report, pictures: bool = True, paper: bool = False
+) -> None:
     """Write a run into an existing folder: trajectories, states, errors, tables, options, and pictures if asked for.
 
-    asked is the dataclass of the command's arguments; options.yaml tells it with the versions.
+    asked is the dataclass of the command's arguments; options.yaml tells it with the versions. For a paper, figures
+    are written as vector PDF, too.
     """
     report.step("write trajectories")
     for localized in estimates.localized:
@@ -50,8 +53,8 @@ def write_run(folder: Path, estimates: Estimates, asked: Any, report: Report, pi
         write_whole_file(folder / "table.md", [table_text([Block(summary)], "md")])
         write_whole_file(folder / "table.tex", [table_text([Block(summary)], "latex")])
     write_whole_file(folder / "options.yaml", [options_text(asked)])
-    if pictures:
-        _write_pictures(folder, estimates, asked, report)
+    if pictures or paper:
+        _write_pictures(folder, estimates, asked, report, paper)
 
 
 def write_localized(folder: Path, result: LocalizeResult) -> None:
@@ -93,15 +96,15 @@ def _places(folder: Path, name: str, rivals: int) -> Iterator[Path]:
         yield place
 
 
-def _write_pictures(folder: Path, estimates: Estimates, asked: Any, report: Report) -> None:
+def _write_pictures(folder: Path, estimates: Estimates, asked: Any, report: Report, paper: bool) -> None:
     record = estimates.record
     report.step("draw figures")
     from poet_loc.report.figures import write_figures
 
-    figures = write_figures(record, folder / "figures")
+    figures = write_figures(record, folder / "figures", paper)
     blocks = [] if estimates.evaluation is None else [Block(to_summary(estimates.evaluation))]
     tables = [table for table in (error_table(blocks), consistency_table(blocks)) if blocks and table.rows]
-    title = f"{estimates.log.path.resolve().name}: {', '.join(estimate.name for estimate in record.estimates)}"
+    title = f"poet-loc on {estimates.log.path.resolve().name}"
     write_report(folder / "report.html", title, tables, figures, options_text(asked))
     report.step("record for rerun")
     from poet_loc.report.rerun_log import write_recording

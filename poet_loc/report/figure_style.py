@@ -43,6 +43,7 @@ _STYLE = {
     "axes.linewidth": 0.6,
     "lines.linewidth": 0.9,
     "legend.frameon": False,
+    "legend.markerscale": 4.0,  # dots are drawn small, for there are many
     "figure.dpi": 160,
     "savefig.dpi": 160,
     "pdf.fonttype": 42,

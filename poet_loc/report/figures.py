@@ -69,9 +69,12 @@ def draw_run(record: RunRecord) -> dict[str, Figure]:
     return figures
 
 
-def write_figures(record: RunRecord, folder: Path, suffix: str = "png") -> list[Path]:
-    """Draw the run and write its figures; return the paths."""
-    return save_figures(draw_run(record), folder, suffix)
+def write_figures(record: RunRecord, folder: Path, paper: bool = False) -> list[Path]:
+    """Draw the run and write its figures as PNG, for a paper as vector PDF beside them; return the PNGs."""
+    figures = draw_run(record)
+    if paper:
+        save_figures(figures, folder, "pdf")
+    return save_figures(figures, folder)
 
 
 @styled
@@ -80,18 +83,18 @@ def error_figure(row: Row, start_ns: int = 0) -> Figure:
     figure, axes = new_figure(3, 2, 4.2)
     seconds = (row.stamps_ns - start_ns) * 1e-9
     for i, j, axis in _PANELS:
-        panel, k, unit = axes[i, j], ERROR_AXES.index(axis), _DEG if j else _MM
-        error = row.errors[:, k] * unit
-        sigma = np.full(len(error), np.nan) if row.sigmas is None else row.sigmas[:, k] * unit
+        panel, k, (scale, unit) = axes[i, j], ERROR_AXES.index(axis), (_DEG, "deg") if j else (_MM, "mm")
+        error = row.errors[:, k] * scale
+        sigma = np.full(len(error), np.nan) if row.sigmas is None else row.sigmas[:, k] * scale
         at, error_line, bound = broken(seconds, error, 3.0 * sigma)
         if np.isfinite(sigma).any():
             panel.fill_between(at, -bound, bound, color=SKY, alpha=0.35, linewidth=0, label="±3σ")
         style = _DOTS if row.name.startswith("localize/") else {"linewidth": 0.8}
         panel.plot(at, error_line, color=BLUE, label="error", **style)
         panel.axhline(0.0, color=TRUTH, linewidth=0.5)
-        panel.set_ylabel(f"{axis} [{'deg' if j else 'mm'}]")
-        beyond = _robust_limits(panel, error, 3.0 * sigma)
-        panel.set_title(_error_note(error, sigma) + beyond, loc="right", fontsize=6.5)
+        panel.set_ylabel(f"{axis} [{unit}]")
+        beyond = _robust_limits(panel, error, 3.0 * sigma, unit)
+        panel.set_title(_error_note(error, sigma, unit) + beyond, loc="right", fontsize=6.5)
     for panel in axes[-1]:
         panel.set_xlabel(_TIME)
     title = f"{label(row)}: errors of the {_BODY_NAMES[row.body]}, coverage {100 * row.coverage:.1f} %"
@@ -254,19 +257,20 @@ def _totals(row: Row) -> tuple[Array, Array]:
     return np.linalg.norm(row.errors[:, :3], axis=1) * _MM, row.angles * _DEG
 
 
-def _error_note(error: Array, sigma: Array) -> str:
+def _error_note(error: Array, sigma: Array, unit: str) -> str:
     known = np.isfinite(sigma)
-    note = f"RMSE {statistics(error).rmse:.2f}"
+    note = f"RMSE {statistics(error).rmse:.2f} {unit}"
     return note + (f", {100 * np.mean(np.abs(error[known]) <= 3 * sigma[known]):.1f} % in 3σ" if known.any() else "")
 
 
-def _robust_limits(panel: Axes, error: Array, bound: Array) -> str:
+def _robust_limits(panel: Axes, error: Array, bound: Array, unit: str) -> str:
     """Show 98 % of the errors and the usual sigma; return what to say of the rest."""
     usual_bound = np.nanpercentile(bound, 75) if np.isfinite(bound).any() else 0.0
     limit = max(1.25 * max(np.percentile(np.abs(error), 98), usual_bound), 1e-6)
     panel.set_ylim(-limit, limit)
     beyond = np.count_nonzero(np.abs(error) > limit)
-    return f"; {beyond} frames beyond, up to {np.abs(error).max():.0f}" if beyond else ""
+    largest = np.abs(error).max()
+    return f"; {beyond} of {len(error)} beyond, up to {largest:.{0 if largest >= 10 else 1}f} {unit}" if beyond else ""
 
 
 def _draw_axes(axes: NDArray[Any], trajectory: Trajectory, start_ns: int, style: dict[str, Any]) -> None:

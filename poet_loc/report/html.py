@@ -14,8 +14,9 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 TABLE_STYLE = """
-.poet-loc table {border-collapse: collapse; font-size: 0.85em; font-variant-numeric: tabular-nums; margin: 0.4em 0}
-.poet-loc th, .poet-loc td {padding: 0.2em 0.6em; text-align: right; border: 0; white-space: nowrap}
+.poet-loc table {border-collapse: collapse; font-size: 0.8em; font-variant-numeric: tabular-nums; margin: 0.4em 0}
+.poet-loc th, .poet-loc td {padding: 0.2em 0.45em; text-align: right; border: 0}
+.poet-loc td, .poet-loc th.name {white-space: nowrap}
 .poet-loc th.name, .poet-loc td.name {text-align: left}
 .poet-loc thead tr:last-child th {border-bottom: 1px solid}
 .poet-loc tr.rule td {border-top: 1px solid}
@@ -28,7 +29,10 @@ TABLE_STYLE = """
 
 def table_html(table: Table) -> str:
     """Return a table element, its notes as paragraphs under it."""
-    headers = [_cell("th", c.header + (f" [{c.unit}]" if c.unit else ""), c) for c in table.columns]
+    units = ["" if table.shared_unit(c.group) else c.unit for c in table.columns]
+    headers = [
+        _cell("th", f"{c.header} [{u}]" if u else c.header, c) for c, u in zip(table.columns, units, strict=True)
+    ]
     rows = []
     for i, row in enumerate(table.rows):
         cells = [
@@ -71,6 +75,7 @@ def _group_row(table: Table) -> str:
         return ""
     cells = []
     for group, members in groupby(table.columns, lambda column: column.group):
-        kind = ' class="group"' if group else ""
-        cells.append(f'<th colspan="{len(list(members))}"{kind}>{escape(group)}</th>')
+        kind, unit = ' class="group"' if group else "", table.shared_unit(group)
+        text = f"{group} [{unit}]" if group and unit else group
+        cells.append(f'<th colspan="{len(list(members))}"{kind}>{escape(text)}</th>')
     return f"<tr>{''.join(cells)}</tr>"

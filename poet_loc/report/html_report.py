@@ -13,13 +13,28 @@ from poet_loc.report.tables import Table
 
 _STYLE = """
 :root {color-scheme: light dark}
-body {font: 16px/1.45 system-ui, sans-serif; max-width: 75rem; margin: 2rem auto; padding: 0 1rem}
+body {font: 16px/1.45 system-ui, sans-serif; max-width: 76rem; margin: 2rem auto; padding: 0 1rem}
 h1 {font-size: 1.5rem} h2 {font-size: 1.15rem; margin-top: 2.2rem}
+summary {font-weight: bold; margin-top: 1.2rem; cursor: pointer}
 figure {margin: 1.2rem 0} figcaption {font-size: 0.85em; opacity: 0.75}
 figure img {background: white; border-radius: 4px}
 .wide {overflow-x: auto}
 pre {font-size: 0.8em; overflow-x: auto}
 """
+
+_OF_ONE_ESTIMATE = {
+    "errors": "error per axis over time, with what the estimate claims as its 3σ",
+    "consistency": "NEES, and NIS of what was gated: inside the grey band the sigmas are true",
+    "landmarks": "which landmark was seen when, and what was made of it",
+}
+"""Figures <kind>_<estimate>.png, in the order of the page, and what they show."""
+
+_OF_ALL = {
+    "top_view": "paths from above, with the landmarks",
+    "error_distribution": "share of the common frames whose error stays below",
+    "trajectory_cam": "pose of the camera, axis by axis",
+    "trajectory_imu": "pose of the IMU, axis by axis",
+}
 
 
 def write_report(path: str | Path, title: str, tables: Sequence[Table], figures: Sequence[Path], options: str) -> None:
@@ -28,7 +43,7 @@ def write_report(path: str | Path, title: str, tables: Sequence[Table], figures:
 
 
 def report_page(title: str, tables: Sequence[Table], figures: Sequence[Path], options: str) -> str:
-    """Return the page as text."""
+    """Return the page as text; figures of single estimates fold away, those of the fusion come first and open."""
     results = [f'<div class="wide">{table_html(table)}</div>' for table in tables]
     parts = [
         '<!DOCTYPE html>\n<html lang="en">\n<head>\n<meta charset="utf-8">',
@@ -38,15 +53,36 @@ def report_page(title: str, tables: Sequence[Table], figures: Sequence[Path], op
         "<h2>Errors</h2>",
         *(results or ["<p>No ground truth: no errors.</p>"]),
         "<h2>Figures</h2>",
-        *map(_figure, figures),
+        *_figures(figures),
         f"<h2>Options and versions</h2>\n<pre>{escape(options)}</pre>",
         "</body>\n</html>\n",
     ]
     return "\n".join(parts)
 
 
-def _figure(path: Path) -> str:
+def _figures(paths: Sequence[Path]) -> list[str]:
+    common: list[tuple[Path, str]] = []
+    single: dict[str, dict[str, Path]] = {}
+    for path in paths:
+        kind, _, estimate = path.stem.partition("_")
+        if kind in _OF_ONE_ESTIMATE:
+            single.setdefault(estimate, {})[kind] = path
+        else:
+            common.append((path, _OF_ALL.get(path.stem, path.stem)))
+    common.sort(key=lambda each: [*_OF_ALL, each[0].stem].index(each[0].stem))
+    parts = [_figure(path, text) for path, text in common]
+    fused_first = sorted(single, key=lambda estimate: not estimate.startswith("fuse_"))
+    for estimate in fused_first:
+        opened = " open" if estimate.startswith("fuse_") or estimate == fused_first[0] else ""
+        parts.append(f"<details{opened}><summary>{escape(estimate.replace('_', '/'))}</summary>")
+        parts += [
+            _figure(single[estimate][kind], text) for kind, text in _OF_ONE_ESTIMATE.items() if kind in single[estimate]
+        ]
+        parts.append("</details>")
+    return parts
+
+
+def _figure(path: Path, text: str) -> str:
     data = base64.b64encode(path.read_bytes()).decode("ascii")
-    name = escape(path.stem)
-    picture = f'<img alt="{name}" src="data:image/png;base64,{data}">'
-    return f"<figure>{picture}<figcaption>{name}</figcaption></figure>"
+    picture = f'<img alt="{escape(path.stem)}" src="data:image/png;base64,{data}">'
+    return f"<figure>{picture}<figcaption>{escape(path.stem)}: {escape(text)}</figcaption></figure>"

@@ -57,7 +57,7 @@ class Table:
         spec = "".join("l" if self._names_row(j) else "r" for j in range(len(self.columns)))
         lines = [r"\begin{table*}", r"\centering", r"\footnotesize", rf"\begin{{tabular}}{{{spec}}}", r"\toprule"]
         lines += self._latex_group_header()
-        units = ["" if self._shared_unit(c.group) else c.unit for c in self.columns]
+        units = ["" if self.shared_unit(c.group) else c.unit for c in self.columns]
         headers = [f"{c.header} [{u}]" if u else c.header for c, u in zip(self.columns, units, strict=True)]
         lines.append(" & ".join(map(_escaped, headers)) + r" \\")
         lines.append(r"\midrule")
@@ -135,7 +135,7 @@ class Table:
         cells, rules, start = [], [], 1
         for group, members in groupby(self.columns, lambda column: column.group):
             columns = list(members)
-            unit = self._shared_unit(group)
+            unit = self.shared_unit(group)
             title = _escaped(f"{group} [{unit}]" if group and unit else group)
             cells.append(rf"\multicolumn{{{len(columns)}}}{{c}}{{{title}}}")
             if group:
@@ -143,7 +143,8 @@ class Table:
             start += len(columns)
         return [" & ".join(cells) + r" \\", " ".join(rules)]
 
-    def _shared_unit(self, group: str) -> str:
+    def shared_unit(self, group: str) -> str:
+        """Return the unit that all columns of a group have, "" where they differ."""
         units = {column.unit for column in self.columns if column.group == group}
         return units.pop() if len(units) == 1 else ""
 

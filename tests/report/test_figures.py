@@ -75,7 +75,7 @@ def test_gross_errors_do_not_shrink_the_rest(run_record: RunRecord) -> None:
     errors[3, 0] = 50.0
     axes = error_figure(replace(row, errors=errors)).axes[0]
     assert axes.get_ylim()[1] < 200.0
-    assert "1 frames beyond, up to 50000" in axes.get_title("right")
+    assert "1 of 102 beyond, up to 50000 mm" in axes.get_title("right")
 
 
 def test_lines_do_not_bridge_gaps() -> None:
@@ -126,11 +126,23 @@ def test_files_are_written_with_something_in_them(run_record: RunRecord, tmp_pat
         with Image.open(path) as image:
             assert image.width == int(figure_style.WIDTH * 160)
             assert np.std(np.asarray(image.convert("L"))) > 5
-    (pdf,) = figure_style.save_figures({"top_view": draw_run(few)["top_view"]}, tmp_path, "pdf")
-    assert pdf.read_bytes().startswith(b"%PDF")
+    assert not list((tmp_path / "figures").glob("*.pdf"))
     assert dict(mpl.rcParams) == before
     with pytest.raises(InputError, match="'bmp'"):
         figure_style.save_figures({}, tmp_path, "bmp")
+
+
+def test_for_a_paper_each_figure_is_a_vector_pdf_too(run_record: RunRecord, tmp_path: Path) -> None:
+    few = replace(run_record, evaluation=None, detections=None, voted={}, fused=())
+    pictures = write_figures(few, tmp_path, paper=True)
+    assert len(pictures) == 3
+    for picture in pictures:
+        content = picture.with_suffix(".pdf").read_bytes()
+        assert content.startswith(b"%PDF")
+        assert b"/FontFile2" in content  # fonts are embedded as TrueType, which publishers ask for
+        assert b"/Subtype /Image" not in content
+        (box,) = re.findall(rb"/MediaBox \[ 0 0 ([0-9.]+) ([0-9.]+) \]", content)
+        assert float(box[0]) == pytest.approx(72 * figure_style.WIDTH, abs=0.1)
 
 
 def test_colours_are_told_apart_by_the_colour_blind() -> None:
