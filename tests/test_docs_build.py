@@ -28,7 +28,9 @@ def built(tmp_path_factory):
 
 def test_links_within_the_documentation_lead_somewhere(built):
     for page in built.rglob("*.html"):
-        for target, anchor in re.findall(r'href="([^"#:?]*)(?:[?][^"#]*)?(?:#([^"]*))?"', page.read_text(encoding="utf-8")):
+        for target, anchor in re.findall(
+            r'href="([^"#:?]*)(?:[?][^"#]*)?(?:#([^"]*))?"', page.read_text(encoding="utf-8")
+        ):
             found = (page.parent / target).resolve() if target else page
             assert found.exists(), f"{page.name}: {target}"
             if anchor and found.suffix == ".html":
