@@ -20,9 +20,9 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from poet_loc.core.records import LandmarkMap
+    from poet_loc.data.world.bop_writer import SceneWriter
     from poet_loc.data.world.sensor import Sensor
     from poet_loc.data.world.view import Assets, Scene
-    from poet_loc.detect.estimator import Sighting
     from poet_loc.detect.options import DetectOptions
     from poet_loc.io.log_folder import Log
 
@@ -84,25 +84,43 @@ def video_folder(options: VideoOptions, number: int) -> Path:
     return options.out / f"video_{number:02d}"
 
 
-def render_video(options: VideoOptions, number: int) -> Path:
-    """Render one video and return its log folder, which appears when it is whole."""
+def render_video(options: VideoOptions, number: int, folder: Path | None = None, progress: bool = False) -> Path:
+    """Render one video and return its log folder, which appears when it is whole.
+
+    folder: where, if not among the others; progress: show a bar of its frames.
+    """
+    from poet_loc.data.render import show_progress
     from poet_loc.data.world.bop_writer import SceneWriter
-    from poet_loc.data.world.sensor import expose
-    from poet_loc.data.world.view import load_assets, place, render_image
+    from poet_loc.data.world.view import load_assets
     from poet_loc.io.log_folder import write_log
 
     assets = load_assets(options.world_seed)
     rng = np.random.default_rng([options.seed, 40, number])
     scene = table_of_video(assets, options, rng)
     log = _recording(options, number, landmarks_of(assets, scene), rng)
+    final = folder or video_folder(options, number)
+    partial = final.with_suffix(".partial")
+    shutil.rmtree(partial, ignore_errors=True)
+    writer = SceneWriter(partial, assets, options.size, masks=False, depth=False)
+    assert log.frames is not None
+    show_progress(_frames(options, assets, scene, log, writer, rng), len(log.frames), 0, "frames", progress)
+    writer.close()
+    write_log(partial, log)
+    partial.rename(final)
+    return final
+
+
+def _frames(
+    options: VideoOptions, assets: Assets, scene: Scene, log: Log, writer: SceneWriter, rng: np.random.Generator
+) -> Iterator[int]:
+    """Render frame by frame."""
+    from poet_loc.data.world.sensor import expose
+    from poet_loc.data.world.view import place, render_image
+
     assert log.T_world_cam is not None
     assert log.calibration is not None
     assert log.calibration.camera is not None
     intrinsics = log.calibration.camera.intrinsics
-    final = video_folder(options, number)
-    partial = final.with_suffix(".partial")
-    shutil.rmtree(partial, ignore_errors=True)
-    writer = SceneWriter(partial, assets, options.size, masks=False, depth=False)
     T_cam_world = log.T_world_cam.T_world_body.inv()
     motion = _image_motion(T_cam_world.as_matrix(), intrinsics) * (options.exposure_s * options.frame_rate_hz)
     sensor = None
@@ -112,10 +130,7 @@ def render_video(options: VideoOptions, number: int) -> Path:
         image = expose(light, replace(sensor, motion=(float(motion[frame, 0]), float(motion[frame, 1]))), rng)
         geometry = place(assets, scene, T_cam_world[frame], intrinsics)
         writer.add(frame, image, sensor.quality, scene, T_cam_world[frame], intrinsics, geometry)
-    writer.close()
-    write_log(partial, log)
-    partial.rename(final)
-    return final
+        yield frame
 
 
 def table_of_video(assets: Assets, options: VideoOptions, rng: np.random.Generator) -> Scene:
@@ -186,36 +201,22 @@ def _sensor_of_video(mean_light: float, rng: np.random.Generator) -> Sensor:
     return replace(sensor, exposure=float(exposure), blur=blur, noise=noise, quality=90)
 
 
-def log_from_pixels(options: VideoOptions, number: int = 0, detection: DetectOptions | None = None) -> Log:
+def log_from_pixels(
+    options: VideoOptions, number: int = 0, detection: DetectOptions | None = None, folder: Path | None = None
+) -> Log:
     """Render a video, detect its objects with the embedded network, and return the log, object_poses.csv included.
 
-    This is the demonstration's world: nothing in the poses comes from anywhere but the pixels.
+    This is the demonstration's world: nothing in the poses comes from anywhere but the pixels.  folder: where the video
+    goes, if not among the others of options.out.
     """
-    from poet_loc.data.render import show_progress
     from poet_loc.data.world.bop_writer import write_models
     from poet_loc.data.world.view import load_assets
-    from poet_loc.detect.options import DetectOptions
-    from poet_loc.detect.outputs import object_poses
-    from poet_loc.detect.stage import sightings
-    from poet_loc.io.frames_csv import read_frames
-    from poet_loc.io.landmarks_json import read_landmarks
+    from poet_loc.detect.stage import detect_in_log
     from poet_loc.io.log_folder import read_log
-    from poet_loc.io.object_poses_csv import write_object_poses
 
     write_models(options.out / "models", load_assets(options.world_seed).objects)
-    folder = video_folder(options, number)
+    folder = folder or video_folder(options, number)
     if not folder.exists():
-        render_video(options, number)
-    found: list[Sighting] = []
-
-    def collect() -> Iterator[None]:
-        for sighting in sightings(folder, detection or DetectOptions()):
-            found.append(sighting)
-            yield
-
-    count = len(read_frames(folder / "frames.csv"))
-    show_progress(collect(), count, 0, "frames", options.progress, "detecting")
-    poses = object_poses(found)
-    on_map = np.isin(poses.object_ids, read_landmarks(folder / "landmarks.json").object_ids)
-    write_object_poses(folder / "object_poses.csv", poses[on_map])  # a log has no objects beyond its map
+        render_video(options, number, folder, options.progress)
+    detect_in_log(folder, "", detection, overwrite=True, progress=options.progress)
     return read_log(folder)

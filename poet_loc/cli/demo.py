@@ -10,16 +10,24 @@ from poet_loc.cli.estimates import StageOptions, estimate_log, refuse_one_estima
 from poet_loc.cli.run import show
 from poet_loc.cli.run_folder import WRITING_STEPS, write_run
 from poet_loc.cli.terminal import progress
-from poet_loc.io.log_folder import write_log
+from poet_loc.io.log_folder import Log, write_log
 from poet_loc.io.whole_folder import whole_folder
+
+DEMO_VIDEO = 12
+"""Number of the video that is shown: the first one beyond the twelve test videos."""
 
 
 @dataclass(frozen=True)
 class Arguments:
-    """A simulated table-top log is written, localised, fused, evaluated, drawn and recorded; nothing is needed."""
+    """A video is rendered, the embedded network sees its objects, and the log goes through every stage: localised,
+    fused, evaluated, drawn and recorded; nothing is needed."""
 
     out: Path = Path("demo")
     """Folder that gets log/, which every other command reads, and run/."""
+    simulated: bool = False
+    """Instead of images and a network: a minute of a simulated table top, whose object poses are drawn at random."""
+    duration_s: float = 15.0
+    """Length of the video, s, at 30 images per second."""
     seed: int = 0
     """Another seed is another world."""
     pictures: bool = True
@@ -32,15 +40,27 @@ class Arguments:
 
 
 def execute(arguments: Arguments) -> None:
-    """Simulate, run all stages, print the tables and name the files."""
+    """Make the log, run all stages, print the tables and name the files."""
     refuse_one_estimator(arguments.options.fusion)
-    with whole_folder(arguments.out, arguments.overwrite) as folder, progress(1 + steps() + WRITING_STEPS) as report:
-        report.step("simulate")
-        log = replace(simulate(SimulationOptions(seed=arguments.seed)), path=arguments.out / "log")
-        (folder / "log").mkdir()
-        write_log(folder / "log", log)
+    place, run = arguments.out / "log", arguments.out / "run"
+    with whole_folder(arguments.out, arguments.overwrite) as folder:
+        log = replace(_simulated(folder, arguments) if arguments.simulated else _seen(folder, arguments), path=place)
+    with whole_folder(run) as folder, progress(steps() + WRITING_STEPS) as report:
         estimates = estimate_log(log, None, arguments.options, report)
-        (folder / "run").mkdir()
-        write_run(folder / "run", estimates, arguments, report, arguments.pictures, arguments.paper)
-    show(estimates, arguments.out / "run")
-    print(f"\nThe log: {arguments.out / 'log'}\nLook at it: poet-loc view {arguments.out / 'run'}")
+        write_run(folder, estimates, arguments, report, arguments.pictures, arguments.paper)
+    show(estimates, run)
+    print(f"\nThe log: {place}\nLook at it: poet-loc view {run}")
+
+
+def _simulated(folder: Path, arguments: Arguments) -> Log:
+    log = simulate(SimulationOptions(seed=arguments.seed))
+    (folder / "log").mkdir()
+    write_log(folder / "log", log)
+    return log
+
+
+def _seen(folder: Path, arguments: Arguments) -> Log:
+    from poet_loc.videos import VideoOptions, log_from_pixels
+
+    video = VideoOptions(folder, duration_s=(arguments.duration_s, arguments.duration_s), seed=arguments.seed)
+    return log_from_pixels(video, DEMO_VIDEO, folder=folder / "log")

@@ -17,6 +17,7 @@ from poet_loc.io.log_folder import Log
 from poet_loc.report.evaluate import Estimate, EvaluateOptions, Evaluation
 from poet_loc.report.log_evaluation import evaluate_log, references_of
 from poet_loc.report.run_record import RunRecord
+from poet_loc.report.seen_images import images_of
 
 Fusion = Literal[
     "eskf/objects",
@@ -71,6 +72,7 @@ class Estimates:
             voted={result.name: result.estimates.voted for result in self.localized},
             camera=None if calibration is None else calibration.camera,
             T_cam_imu=None if calibration is None else calibration.T_cam_imu,
+            images=images_of(self.log, self.detections),
         )
 
 

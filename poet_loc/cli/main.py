@@ -17,7 +17,7 @@ from typing import Any
 from poet_loc.core.input_error import InputError
 
 COMMANDS = {
-    "demo": "the embedded default from end to end: a simulated log, then everything that run does",
+    "demo": "the embedded default from end to end: from rendered images to a trajectory with its errors",
     "run": "localise in all modes, fuse with all estimators, evaluate, draw and record",
     "detect": "images, a video or a log become object poses with covariances",
     "train": "a pose network from images with poses",

@@ -7,7 +7,9 @@ goes on where it stopped.
 from __future__ import annotations
 
 import shutil
-from collections.abc import Iterable
+import sys
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -99,14 +101,23 @@ def render_scene(options: RenderOptions, number: int, count: int) -> int:
     return number
 
 
-def show_progress(
-    done: Iterable[object], total: int, already: int, noun: str, visible: bool, verb: str = "rendering"
-) -> None:
+def show_progress(done: Iterable[object], total: int, already: int, noun: str, visible: bool) -> None:
     """Draw a bar while `done` yields one result after the other."""
+    with progress_bar("rendering", noun, total, visible, already) as advance:
+        for _ in done:
+            advance(1)
+
+
+@contextmanager
+def progress_bar(
+    verb: str, noun: str, total: int | None, visible: bool = True, already: int = 0
+) -> Iterator[Callable[[int], None]]:
+    """Yield what advances a bar on stderr; nothing is drawn where that is no terminal.  total None: not known."""
+    from rich.console import Console
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
     columns = (TextColumn(verb), BarColumn(), MofNCompleteColumn(), TextColumn(noun), TimeRemainingColumn())
-    with Progress(*columns, disable=not visible) as progress:
+    shown = visible and sys.stderr.isatty()
+    with Progress(*columns, console=Console(stderr=True), disable=not shown) as progress:
         task = progress.add_task(noun, total=total, completed=already)
-        for _ in done:
-            progress.advance(task)
+        yield lambda count: progress.advance(task, count)

@@ -16,9 +16,9 @@ from torch import Tensor
 
 from poet_loc.core.input_error import InputError
 from poet_loc.data.samples import to_tensor
-from poet_loc.detect.box_file import read_boxes
 from poet_loc.detect.image_source import Picture
 from poet_loc.detect.options import DetectOptions
+from poet_loc.io.boxes_csv import read_boxes
 from poet_loc.model.backbone import Features, ImageBatch, batch_images
 from poet_loc.model.checkpoint import ModelConfig, load_model
 from poet_loc.model.fast_poses import FastPoses
@@ -49,6 +49,23 @@ class Sighting:
     seconds: float
     """Run time per picture."""
 
+    def of_objects(self, known: NDArray[np.int64]) -> Sighting:
+        """Return the rows of these objects."""
+        keep = np.isin(self.object_ids, known)
+        if keep.all():
+            return self
+        columns = ("labels", "object_ids", "scores", "boxes", "translations", "rotations")
+        covariances = None if self.covariances is None else self.covariances[keep]
+        return replace(self, **{name: getattr(self, name)[keep] for name in columns}, covariances=covariances)
+
+    @property
+    def corners_px(self) -> Array:
+        """(n, 6) x1, y1, x2, y2 (px), score, class."""
+        height, width = self.picture.pixels.shape[:2]
+        middle, half = self.boxes[:, :2], self.boxes[:, 2:] / 2
+        corners = np.concatenate([middle - half, middle + half], axis=1) * [width, height, width, height]
+        return np.concatenate([corners, self.scores[:, None], self.labels[:, None]], axis=1)
+
 
 class PoseEngine(Protocol):
     """What computes poses from features: the network itself, its fast path, or an exported graph."""
@@ -74,7 +91,8 @@ class Estimator:
         self.intrinsics = options.intrinsics or intrinsics or self.config.intrinsics
         if self.config.network.needs_intrinsics and self.intrinsics is None:
             raise InputError("this network needs the camera's intrinsics", fix="give --intrinsics fx fy cx cy")
-        self.boxes = None if options.boxes is None else read_boxes(options.boxes)
+        given = {} if options.boxes is None else read_boxes(options.boxes)
+        self.boxes = {name: torch.from_numpy(rows).float() for name, rows in given.items()}
         self.multiple = self.network.detector.shape().multiple
         self._warned = False
 
@@ -103,7 +121,7 @@ class Estimator:
 
     def _queries(self, pictures: Sequence[Picture], batch: ImageBatch, features: Features) -> QueryBoxes:
         nothing = torch.zeros(0, 6)
-        if self.boxes is not None:
+        if self.options.boxes is not None:
             found = [self.boxes.get(Path(p.name).name, nothing) for p in pictures]
         else:
             found = self.network.detector.detect(features)

@@ -37,6 +37,8 @@ class DetectOptions:
     """fx, fy, cx, cy (px); else those of the log's calibration.yaml, else of the camera of the training images."""
     scene: int = 0
     """Scene number in the BOP results."""
+    unknown_objects: bool = False
+    """On a log with landmarks.json, keep detections of objects that the map does not have."""
     overlays: bool = False
     """Draw boxes and axes into copies of the images."""
     axis_m: float = 0.05

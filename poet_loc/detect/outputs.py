@@ -12,12 +12,13 @@ from poet_loc.core.geometry import make_pose
 from poet_loc.core.records import ObjectPoses
 from poet_loc.detect.estimator import Sighting
 from poet_loc.io.bop_results_csv import BopResults, write_bop_results
+from poet_loc.io.boxes_csv import write_boxes
 from poet_loc.io.object_poses_csv import count_instances, write_object_poses
 from poet_loc.io.poet_results import PoetResults, poet_image_id, write_poet_results
 
 
 class PoseFiles:
-    """object_poses.csv, bop_results.csv and results.json of a growing number of pictures."""
+    """object_poses.csv, boxes.csv, bop_results.csv and results.json of a growing number of pictures."""
 
     def __init__(self, folder: Path, scene: int) -> None:
         self.folder, self.scene = folder, scene
@@ -27,6 +28,8 @@ class PoseFiles:
     def append(self, sightings: Sequence[Sighting]) -> None:
         """Write the rows of some pictures, which come in order of time."""
         self._append("object_poses.csv", lambda path: write_object_poses(path, object_poses(sightings)))
+        boxes = {sighting.picture.name: sighting.corners_px for sighting in sightings}
+        self._append("boxes.csv", lambda path: write_boxes(path, boxes))
         self._append("bop_results.csv", lambda path: write_bop_results(path, bop_results(sightings, self.scene)))
         results = poet_results(sightings, [self._image_id(s.picture.name) for s in sightings])
         part = self.folder / "part"

@@ -20,13 +20,14 @@ from poet_loc.core.records import Camera, LandmarkMap
 from poet_loc.core.trajectory import Trajectory
 from poet_loc.report.evaluate import ERROR_AXES, Body, Estimate, Row
 from poet_loc.report.fused import Fused
+from poet_loc.report.rerun_log_images import image_view, log_images
+from poet_loc.report.rerun_log_time import TIMELINE, time_column
 from poet_loc.report.run_record import DECISIONS, Decisions, RunRecord
 
 Array = NDArray[np.float64]
 Stamps = NDArray[np.int64]
 Colour = tuple[int, int, int]
 
-TIMELINE = "sensor_time"
 MAX_ROWS = 20_000
 """Longest column of one entity; longer ones are thinned evenly."""
 MAX_RATE_HZ = 50.0
@@ -45,14 +46,13 @@ _PALETTE: tuple[Colour, ...] = (
 _DECISION_COLOURS = (0xD55E00FF, 0xE69F00FF, 0xCC79A7FF, 0x0072B2FF)
 _NOT_SEEN = "not seen"
 _UNITS = ("mm", "mm", "mm", "deg", "deg", "deg")
-_EPOCH_NS = 10**17  # stamps beyond it (1973) count from 1970, stamps before it from the sensor's start
 
 
 def write_recording(record: RunRecord, path: str | Path, name: str = "poet-loc") -> None:
     """Write a run to an .rrd file that `rerun` and `poet-loc view` open, with its layout in it.
 
     Entities: world/landmarks, world/ground_truth/<body>, world/estimates/<estimate>, errors/<axis>/<estimate>,
-    states/<estimate>, consistency/<estimate>, decisions/<estimate>/<landmark>.
+    states/<estimate>, consistency/<estimate>, decisions/<estimate>/<landmark>, camera/image.
     """
     recording = rr.RecordingStream("poet-loc")
     with recording:
@@ -75,6 +75,8 @@ def write_recording(record: RunRecord, path: str | Path, name: str = "poet-loc")
         for estimator, decisions in record.decisions.items():
             _log_decisions(recording, record, estimator, decisions)
         _log_detections(recording, record)
+        if record.images is not None:
+            log_images(recording, record.images, record.detections, record.camera, record.landmark_label)
 
 
 def _log_landmarks(recording: rr.RecordingStream, record: RunRecord, landmark_map: LandmarkMap) -> None:
@@ -119,7 +121,7 @@ def _log_trajectory(
     pose = f"{entity}/pose"
     T = trajectory.T_world_body
     columns = rr.Transform3D.columns(translation=T.translation, quaternion=T.rotation.as_quat())
-    recording.send_columns(pose, [_time(trajectory.stamps_ns)], columns)
+    recording.send_columns(pose, [time_column(trajectory.stamps_ns)], columns)
     recording.log(pose, rr.TransformAxes3D(0.05), static=True)
     if record.camera is not None and (body == "cam" or record.T_cam_imu is not None):
         if body == "imu" and record.T_cam_imu is not None:
@@ -150,13 +152,13 @@ def _log_ellipsoids(recording: rr.RecordingStream, entity: str, estimate: Estima
         rr.Ellipsoids3D.from_fields(colors=[colour], fill_mode=rr.components.FillMode.MajorWireframe),
         static=True,
     )
-    recording.send_columns(entity, [_time(stamps_ns)], columns)
+    recording.send_columns(entity, [time_column(stamps_ns)], columns)
 
 
 def _log_errors(recording: rr.RecordingStream, row: Row, colour: Colour) -> None:
     """Each axis's error as a line, its 3-sigma as a band about zero, and the NEES."""
     step = _step(row.stamps_ns)
-    time = _time(row.stamps_ns[::step])
+    time = time_column(row.stamps_ns[::step])
     for axis, unit, error in zip(ERROR_AXES, _UNITS, row.errors[::step].T, strict=True):
         entity = f"errors/{axis}/{row.name}"
         style = rr.SeriesLines(colors=colour, names=f"{row.name} [{unit}]", widths=1.5)
@@ -179,7 +181,7 @@ def _log_errors(recording: rr.RecordingStream, row: Row, colour: Colour) -> None
 def _log_states(recording: rr.RecordingStream, fused: Fused) -> None:
     """Biases and velocity with their 3-sigma bands."""
     step = _step(fused.stamps_ns)
-    time = _time(fused.stamps_ns[::step])
+    time = time_column(fused.stamps_ns[::step])
     states = (
         ("gyroscope_bias", fused.gyroscope_bias, slice(9, 12), "rad/s"),
         ("accelerometer_bias", fused.accelerometer_bias, slice(12, 15), "m/s²"),
@@ -193,7 +195,7 @@ def _log_states(recording: rr.RecordingStream, fused: Fused) -> None:
         _send_measurements(recording, entity, time, values[::step], variances, names, colours)
     if fused.gate is not None:
         step = _step(fused.gate.stamps_ns)
-        time = _time(fused.gate.stamps_ns[::step])
+        time = time_column(fused.gate.stamps_ns[::step])
         parts = (("position", fused.gate.nis_position, _PALETTE[0]), ("rotation", fused.gate.nis_rotation, _PALETTE[4]))
         for part, nis, colour in parts:
             entity = f"consistency/{fused.name}/nis_{part}_per_dof"
@@ -211,7 +213,7 @@ def _log_decisions(recording: rr.RecordingStream, record: RunRecord, name: str, 
         recording.log(entity, rr.StateConfiguration(values=states, labels=states, colors=colours), static=True)
         at_ns, changed = _changes(stamps_ns, decided)
         texts = [states[index] for index in changed]
-        recording.send_columns(entity, [_time(at_ns)], rr.StateChange.columns(state=texts))
+        recording.send_columns(entity, [time_column(at_ns)], rr.StateChange.columns(state=texts))
 
 
 def _log_detections(recording: rr.RecordingStream, record: RunRecord) -> None:
@@ -227,7 +229,7 @@ def _log_detections(recording: rr.RecordingStream, record: RunRecord) -> None:
     entity = "world/ground_truth/cam/pose/detections"
     columns = rr.Points3D.columns(positions=detections.T_cam_obj.translation, colors=colours.astype(np.uint8))
     recording.log(entity, rr.Points3D.from_fields(radii=rr.Radius.ui_points(3.0)), static=True)
-    recording.send_columns(entity, [_time(stamps_ns)], columns.partition(counts))
+    recording.send_columns(entity, [time_column(stamps_ns)], columns.partition(counts))
 
 
 def _blueprint(record: RunRecord) -> rrb.Blueprint:
@@ -263,7 +265,10 @@ def _blueprint(record: RunRecord) -> rrb.Blueprint:
     ]
     column = [rrb.Tabs(*part) for part in (tabs, lanes) if part]
     shares = [2, 1][: len(column)]
-    layout = rrb.Horizontal(world, rrb.Vertical(*column, row_shares=shares), column_shares=[3, 2]) if column else world
+    space: Any = world
+    if record.images is not None:
+        space = rrb.Vertical(world, image_view(), row_shares=[3, 2])
+    layout = rrb.Horizontal(space, rrb.Vertical(*column, row_shares=shares), column_shares=[3, 2]) if column else space
     return rrb.Blueprint(layout, rrb.TimePanel(timeline=TIMELINE, expanded=False), collapse_panels=True)
 
 
@@ -375,12 +380,6 @@ def _step(stamps_ns: Stamps) -> int:
         return 1
     interval_s = float(np.median(np.diff(stamps_ns))) * 1e-9
     return max(1 + (len(stamps_ns) - 1) // MAX_ROWS, int(1.001 / (MAX_RATE_HZ * interval_s)) if interval_s else 1, 1)
-
-
-def _time(stamps_ns: Stamps) -> rr.TimeColumn:
-    if len(stamps_ns) and stamps_ns[0] > _EPOCH_NS:
-        return rr.TimeColumn(TIMELINE, timestamp=stamps_ns.astype("datetime64[ns]"))
-    return rr.TimeColumn(TIMELINE, duration=stamps_ns.astype("timedelta64[ns]"))
 
 
 def _in_unit(values: Any, unit: str) -> Array:

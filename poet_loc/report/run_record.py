@@ -13,6 +13,7 @@ from poet_loc.core.records import Camera, LandmarkMap, ObjectPoses
 from poet_loc.core.trajectory import Trajectory
 from poet_loc.report.evaluate import Body, Estimate, Evaluation
 from poet_loc.report.fused import Fused, Gates
+from poet_loc.report.seen_images import SeenImages
 
 Mask = NDArray[np.bool_]
 Stamps = NDArray[np.int64]
@@ -36,6 +37,7 @@ class RunRecord:
     """By the estimate's name, (D,): which detections it used."""
     camera: Camera | None = None
     T_cam_imu: RigidTransform | None = None
+    images: SeenImages | None = None
 
     @property
     def start_ns(self) -> int:

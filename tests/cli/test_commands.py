@@ -286,11 +286,26 @@ def test_simulate_writes_a_log_and_runs_many(tmp_path, capsys):
     assert "--runs" in one_line(capsys)
 
 
-def test_demo_writes_a_log_and_a_run(tmp_path, monkeypatch, capsys):
+def test_demo_shows_what_the_network_sees(tmp_path, capsys):
+    out = tmp_path / "demo"
+    assert main(["demo", "--out", str(out), "--duration-s", "2", "--no-pictures"]) == 0
+    log = read_log(out / "log")
+    poses = log.detections()[1]
+    assert 50 < len(np.unique(poses.frames)) <= len(log.frames) == len(list((out / "log" / "rgb").iterdir()))
+    assert poses.covariances is not None
+    assert (out / "log" / "boxes.csv").exists()
+    assert {"camera_poses.csv", "errors.csv", "summary.json", "table.md", "localize"} <= files(out / "run")
+    assert rmse_mm(summary(out / "run")["localize/robust"]) < 300.0
+    assert str(out / "run" / "summary.json") in capsys.readouterr().out
+    assert main(["demo", "--out", str(out), "--duration-s", "2"]) == 1
+    assert "--overwrite" in one_line(capsys)
+
+
+def test_the_simulated_demo_writes_a_log_and_a_run(tmp_path, monkeypatch, capsys):
     from poet_loc.cli import demo
 
     monkeypatch.setattr(demo, "simulate", lambda options: simulate(replace(options, duration_s=6.0)))
-    assert main(["demo", "--out", str(tmp_path / "demo"), "--seed", "2"]) == 0
+    assert main(["demo", "--simulated", "--out", str(tmp_path / "demo"), "--seed", "2"]) == 0
     shown = capsys.readouterr().out
     assert files(tmp_path / "demo" / "run") == FILES
     assert str(tmp_path / "demo" / "run" / "recording.rrd") in shown

@@ -19,11 +19,12 @@ from poet_loc.core.input_error import InputError
 from poet_loc.data.batches import queries_of_targets
 from poet_loc.data.bop_dataset import BopDataset
 from poet_loc.data.samples import read_image, targets_of, to_tensor
-from poet_loc.detect.box_file import read_boxes
 from poet_loc.detect.image_source import open_images
 from poet_loc.detect.options import DetectOptions
-from poet_loc.detect.stage import detect, sightings
+from poet_loc.detect.stage import detect, detect_in_log, sightings
 from poet_loc.io.bop_results_csv import read_bop_results
+from poet_loc.io.boxes_csv import read_boxes
+from poet_loc.io.log_folder import read_log
 from poet_loc.io.object_poses_csv import read_object_poses
 from poet_loc.io.poet_results import read_poet_results
 from poet_loc.model.backbone import batch_images
@@ -100,6 +101,53 @@ def test_files_of_a_run(images: Path, boxes: Path, tmp_path: Path) -> None:
     assert json.loads((out / "summary.json").read_text())["images"] == 4
     overlay = read_image(out / "overlays" / "000001.png")
     assert (overlay != read_image(images / "000001.png")).any()
+
+
+def test_the_boxes_of_a_run_give_the_same_poses_again(images: Path, boxes: Path, tmp_path: Path) -> None:
+    weights = save_tiny(tmp_path / "net.safetensors")
+    first = detect(images, tmp_path / "first", DetectOptions(weights, boxes=boxes))
+    again = detect(images, tmp_path / "again", DetectOptions(weights, boxes=first / "boxes.csv"))
+    one, other = (read_object_poses(out / "object_poses.csv") for out in (first, again))
+    np.testing.assert_allclose(other.T_cam_obj.as_matrix(), one.T_cam_obj.as_matrix(), atol=1e-3)
+    np.testing.assert_allclose(other.scores, one.scores, atol=1e-5)
+
+
+@pytest.fixture
+def log(images: Path, tmp_path: Path) -> Path:
+    """A log of the images whose map has object 5 alone."""
+    folder = tmp_path / "log"
+    folder.mkdir()
+    names = sorted(file.name for file in images.iterdir())
+    (folder / "rgb").symlink_to(images)
+    rows = [f"{number * 40_000_000},{number},rgb/{name}" for number, name in enumerate(names)]
+    (folder / "frames.csv").write_text("\n".join(["timestamp_ns,frame,image", *rows]) + "\n")
+    landmark = {"object_id": 5, "instance": 0, "name": "five", "t": [0, 0, 0], "q_xyzw": [0, 0, 0, 1]}
+    (folder / "landmarks.json").write_text(
+        json.dumps({"landmarks": [landmark | {"covariance": None, "symmetry": None}]})
+    )
+    return folder
+
+
+def test_a_log_keeps_what_its_map_has_and_is_told_of_the_rest(log: Path, boxes: Path, tmp_path: Path) -> None:
+    weights = save_tiny(tmp_path / "net.safetensors")
+    options = DetectOptions(weights, boxes=boxes, intrinsics=CAMERA)
+    with pytest.warns(UserWarning, match=r"left out 4 detections .* 2 \(4\)") as told:
+        path = detect_in_log(log, "mine", options)
+    assert len(told) == 1
+    assert path == log / "object_poses_mine.csv"
+    (poses,) = read_log(log).object_poses.values()
+    assert poses.object_ids.tolist() == [5] * 4
+    assert poses.stamps_ns.tolist() == [0, 40_000_000, 80_000_000, 120_000_000]
+    assert {rows[0, 5] for rows in read_boxes(log / "boxes_mine.csv").values()} == {2.0}
+    assert {file.name for file in log.iterdir()} == {
+        "rgb", "frames.csv", "landmarks.json", "object_poses_mine.csv", "boxes_mine.csv"
+    }  # fmt: skip
+    with pytest.raises(InputError, match="exists already"):
+        detect_in_log(log, "mine", options)
+    with pytest.raises(InputError, match="no log with frames"):
+        detect_in_log(log / "rgb", options=options)
+    everything = detect(log, tmp_path / "all", replace(options, unknown_objects=True))
+    assert len(read_object_poses(everything / "object_poses.csv")) == 8
 
 
 def _centre(box: np.ndarray) -> list[float]:

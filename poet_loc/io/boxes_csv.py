@@ -1,28 +1,29 @@
-"""Boxes from another program: csv with image,x1,y1,x2,y2,score,class."""
+"""Boxes of objects in images: csv with image,x1,y1,x2,y2,score,class."""
 
 from __future__ import annotations
 
 import csv
+from collections.abc import Mapping
 from pathlib import Path
 
-import torch
-from torch import Tensor
+import numpy as np
+from numpy.typing import NDArray
 
 from poet_loc.core.input_error import InputError
+from poet_loc.io.input_text import read_text
+from poet_loc.io.whole_folder import write_whole_file
+
+Array = NDArray[np.float64]
 
 HEADER = ["image", "x1", "y1", "x2", "y2", "score", "class"]
 
 
-def read_boxes(path: str | Path) -> dict[str, Tensor]:
+def read_boxes(path: str | Path) -> dict[str, Array]:
     """Read boxes by file name of their image, (n, 6) each: x1, y1, x2, y2 (px), score, class from 1.
 
     Raises InputError, with the line, for a malformed row.
     """
-    try:
-        lines = Path(path).read_text().splitlines()
-    except FileNotFoundError:
-        raise InputError("no such file", path=path) from None
-    reader = csv.reader(lines)
+    reader = csv.reader(read_text(path).splitlines())
     header = next(reader, [])
     if [cell.strip() for cell in header] != HEADER:
         raise InputError(f"the header is {','.join(header)!r}", path=path, line=1, fix=f"write {','.join(HEADER)}")
@@ -38,4 +39,14 @@ def read_boxes(path: str | Path) -> dict[str, Tensor]:
         if not (x2 > x1 and y2 > y1 and label >= 1 and label == int(label)):
             raise InputError("needs x1 < x2, y1 < y2 and a class from 1", path=path, line=reader.line_num)
         rows.setdefault(Path(name.strip()).name, []).append([x1, y1, x2, y2, score, label])
-    return {name: torch.tensor(found) for name, found in rows.items()}
+    return {name: np.array(found) for name, found in rows.items()}
+
+
+def write_boxes(path: str | Path, boxes: Mapping[str, Array]) -> None:
+    """Write boxes (n, 6) by file name of their image."""
+    lines = [
+        f"{name},{x1:.3f},{y1:.3f},{x2:.3f},{y2:.3f},{score:.5f},{label:.0f}\n"
+        for name, rows in boxes.items()
+        for x1, y1, x2, y2, score, label in rows.tolist()
+    ]
+    write_whole_file(path, [",".join(HEADER) + "\n", *lines])
