@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from fusion import filter_loop, memory
+from fusion.calibrated import calibrated
 from fusion.eskf import POSITION_ONLY, ROTATION_ONLY
 from fusion.measurements import Measurements
 from fusion.options import FuseOptions
@@ -84,7 +85,7 @@ def run_filter(
     written = loop(floats, integers, *columns)
     if written == 0:
         raise never_started(problem, options)
-    counters = memory.views.py_func(floats, integers).counters
+    m = memory.views.py_func(floats, integers)
     result = result_from_rows(
         f"fuse/{estimator}/{options.measurements}",
         (
@@ -95,9 +96,9 @@ def run_filter(
         ),
         gate_log(problem, columns.decisions, columns.nis),
         time.perf_counter() - began,
-        int(counters[memory.RESTARTS]),
+        int(m.counters[memory.RESTARTS]),
     )
-    return replace(result, motion=problem.motion, body=problem.body)
+    return replace(result, motion=problem.motion, body=problem.body, calibrated=calibrated(m, problem))
 
 
 def loop_columns(problem: Problem) -> LoopColumns:

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import time
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from fusion import memory
+from fusion.calibrated import calibrated
 from fusion.fuse import gate_log, result_from_rows
 from fusion.graph_builder import GraphBuilder
 from fusion.graph_factors import ImuChain
@@ -52,13 +54,14 @@ def run_fixed_lag(problem: Problem, options: FuseOptions) -> FuseResult:
         walk.rewrite()
     if smoother is None:
         raise not_started(problem, options)
-    return result_from_rows(
+    result = result_from_rows(
         f"fuse/{options.estimator}/{options.measurements}",
         walk.rows,
         gate_log(problem, walk.decisions, walk.nis),
         time.perf_counter() - began,
         int(walk.memory.counters[memory.RESTARTS]),
     )
+    return replace(result, calibrated=calibrated(walk.memory, problem))
 
 
 def not_started(problem: Problem, options: FuseOptions) -> InputError:

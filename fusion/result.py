@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import RigidTransform
 
 from poet_loc.core.trajectory import Trajectory
+
+if TYPE_CHECKING:
+    from fusion.calibrated import Calibrated
 
 Array = NDArray[np.float64]
 Stamps = NDArray[np.int64]
@@ -63,6 +66,8 @@ class FuseResult:
     """Whose trajectory T_world_imu is: the camera's where the log says nothing of an IMU."""
     restarts: int = 0
     """How often the filter was lost and started again."""
+    calibrated: Calibrated | None = None
+    """Extrinsics, time offset, gravity and map as they were last estimated; None where all were taken as given."""
 
     def __len__(self) -> int:
         return len(self.stamps_ns)

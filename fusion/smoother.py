@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fusion import filter_loop, memory, tape
+from fusion.calibrated import calibrated
 from fusion.fuse import LoopColumns, gate_log, loop_columns, never_started, result_from_rows
 from fusion.nav_state import CORE, StateLayout
 from fusion.options import FuseOptions
@@ -49,15 +50,16 @@ def run_smoother(problem: Problem, options: FuseOptions) -> FuseResult:
     columns, core, covariance = smooth(problem, floats, integers)
     if len(core) == 0:
         raise never_started(problem, options)
+    m = memory.views.py_func(floats, integers)
     sigma = np.sqrt(np.diagonal(covariance, axis1=1, axis2=2).clip(min=0.0))
     result = result_from_rows(
         f"fuse/eskf-smoothed/{options.measurements}",
         (columns.out_stamps[: len(core)], core, sigma, np.ascontiguousarray(covariance[:, :6, :6])),
         gate_log(problem, columns.decisions, columns.nis),
         time.perf_counter() - began,
-        int(memory.views.py_func(floats, integers).counters[memory.RESTARTS]),
+        int(m.counters[memory.RESTARTS]),
     )
-    return replace(result, motion=problem.motion, body=problem.body)
+    return replace(result, motion=problem.motion, body=problem.body, calibrated=calibrated(m, problem))
 
 
 def smooth(problem: Problem, floats: Array, integers: Stamps) -> tuple[LoopColumns, Array, Array]:

@@ -31,6 +31,7 @@ from poet_loc.report.tables import Table
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
+    from fusion.calibrated import Calibrated
     from fusion.result import FuseResult
     from landmarks.localize import LocalizeOptions, LocalizeResult
 
@@ -118,6 +119,11 @@ class FusedTrajectory(Result):
 
     result: FuseResult = field(kw_only=True)
     """Everything that the estimator says: velocity, biases, sigmas, covariances, gate decisions."""
+
+    @property
+    def calibrated(self) -> Calibrated | None:
+        """Extrinsics, time offset, gravity and map, each with its sigma, as far as options.estimate asks for them."""
+        return self.result.calibrated
 
 
 @dataclass(frozen=True)

@@ -15,7 +15,10 @@ from fusion.result import FuseResult
 from landmarks.localize import LocalizeResult
 from poet_loc.cli.estimates import Estimates
 from poet_loc.cli.terminal import Report
+from poet_loc.core.records import Calibration
+from poet_loc.io.calibration_yaml import write_calibration
 from poet_loc.io.camera_poses_csv import write_camera_poses
+from poet_loc.io.landmarks_json import write_landmarks
 from poet_loc.io.tum import write_tum
 from poet_loc.io.whole_folder import write_whole_file
 from poet_loc.report.error_tables import Block, consistency_table, error_table, table_text
@@ -46,6 +49,7 @@ def write_run(
     for fused in estimates.fused:
         for place in _places(folder, fused.name, len(estimates.fused)):
             write_fused(place, fused)
+            write_calibrated(place, fused, estimates.log.calibration)
     if estimates.evaluation is not None:
         summary = to_summary(estimates.evaluation)
         write_summary(folder / "summary.json", summary)
@@ -69,6 +73,17 @@ def write_fused(folder: Path, result: FuseResult) -> None:
     if not path.exists():
         write_tum(path, result.trajectory)
     write_states(folder / "states.csv", result)
+
+
+def write_calibrated(folder: Path, result: FuseResult, calibration: Calibration | None) -> None:
+    """Write what was estimated beside the trajectory, as a log has it: calibration.yaml and landmarks.json."""
+    found = result.calibrated
+    if found is None:
+        return
+    if found.T_imu_cam is not None or found.timeshift_cam_imu_s is not None:
+        write_calibration(folder / "calibration.yaml", found.applied_to(calibration or Calibration()))
+    if found.landmark_map is not None:
+        write_landmarks(folder / "landmarks.json", found.landmark_map)
 
 
 def options_text(asked: Any) -> str:

@@ -8,6 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import RigidTransform
 
+from poet_loc.core.records import LandmarkMap
+
 Array = NDArray[np.float64]
 Stamps = NDArray[np.int64]
 Mask = NDArray[np.bool_]
@@ -46,6 +48,14 @@ class Gates(Protocol):
     @property
     def rotation_accepted(self) -> Mask:
         """(M,)"""
+
+
+class Calibrated(Protocol):
+    """What was estimated beside the trajectory."""
+
+    @property
+    def landmark_map(self) -> LandmarkMap | None:
+        """The map as it was found; None where it was taken as given."""
 
 
 class Fused(Protocol):
@@ -90,3 +100,7 @@ class Fused(Protocol):
     @property
     def runtime_s(self) -> float | None:
         """s"""
+
+    @property
+    def calibrated(self) -> Calibrated | None:
+        """None where nothing beside the trajectory was estimated"""

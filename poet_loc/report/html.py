@@ -61,7 +61,9 @@ def figure_html(figure: Figure, description: str, dpi: int = 120) -> str:
 
 def fragment(*parts: str) -> str:
     """Return a piece of a page with the style that it needs."""
-    return "\n".join(['<div class="poet-loc">', f"<style>{TABLE_STYLE}</style>", *parts, "</div>"])
+    return "\n".join(
+        ['<div class="poet-loc" style="overflow-x: auto">', f"<style>{TABLE_STYLE}</style>", *parts, "</div>"]
+    )
 
 
 def _cell(tag: str, text: str, column: Column, bold: bool = False) -> str:

@@ -51,8 +51,8 @@ _UNITS = ("mm", "mm", "mm", "deg", "deg", "deg")
 def write_recording(record: RunRecord, path: str | Path, name: str = "poet-loc") -> None:
     """Write a run to an .rrd file that `rerun` and `poet-loc view` open, with its layout in it.
 
-    Entities: world/landmarks, world/ground_truth/<body>, world/estimates/<estimate>, errors/<axis>/<estimate>,
-    states/<estimate>, consistency/<estimate>, decisions/<estimate>/<landmark>, camera/image.
+    Entities: world/landmarks, world/landmarks_found/<estimate>, world/ground_truth/<body>, world/estimates/<estimate>,
+    errors/<axis>/<estimate>, states/<estimate>, consistency/<estimate>, decisions/<estimate>/<landmark>, camera/image.
     """
     recording = rr.RecordingStream("poet-loc")
     with recording:
@@ -60,7 +60,7 @@ def write_recording(record: RunRecord, path: str | Path, name: str = "poet-loc")
         recording.send_recording_name(name)
         recording.log("world", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
         if record.landmark_map is not None and len(record.landmark_map):
-            _log_landmarks(recording, record, record.landmark_map)
+            _log_landmarks(recording, "world/landmarks", record, record.landmark_map, _PALETTE[4])
         for body, trajectory in record.references.items():
             _log_trajectory(recording, record, f"world/ground_truth/{body}", trajectory, body, _TRUTH)
         colours = _colours(record.estimates)
@@ -72,6 +72,10 @@ def write_recording(record: RunRecord, path: str | Path, name: str = "poet-loc")
             _log_errors(recording, row, colours.get(row.name, _ORACLE))
         for fused in record.fused:
             _log_states(recording, fused)
+            found = None if fused.calibrated is None else fused.calibrated.landmark_map
+            if found is not None and len(found):
+                entity = f"world/landmarks_found/{fused.name}"
+                _log_landmarks(recording, entity, record, found, colours.get(fused.name, _ORACLE))
         for estimator, decisions in record.decisions.items():
             _log_decisions(recording, record, estimator, decisions)
         _log_detections(recording, record)
@@ -79,7 +83,10 @@ def write_recording(record: RunRecord, path: str | Path, name: str = "poet-loc")
             log_images(recording, record.images, record.detections, record.camera, record.landmark_label)
 
 
-def _log_landmarks(recording: rr.RecordingStream, record: RunRecord, landmark_map: LandmarkMap) -> None:
+def _log_landmarks(
+    recording: rr.RecordingStream, entity: str, record: RunRecord, landmark_map: LandmarkMap, colour: Colour
+) -> None:
+    """The map as it was given, or as an estimate found it, with what is known of its error."""
     T = landmark_map.T_world_obj
     labels = [record.landmark_label(*landmark.key) for landmark in landmark_map]
     boxes = rr.Boxes3D(
@@ -87,20 +94,20 @@ def _log_landmarks(recording: rr.RecordingStream, record: RunRecord, landmark_ma
         half_sizes=[[0.02, 0.02, 0.02]] * len(labels),
         quaternions=T.rotation.as_quat(),
         labels=labels,
-        colors=_PALETTE[4],
+        colors=colour,
     )
-    recording.log("world/landmarks", boxes, static=True)
+    recording.log(entity, boxes, static=True)
     axes = 0.06 * T.rotation.as_matrix().mT.reshape(-1, 3)  # rows x, y, z of each landmark
     origins, colours = np.repeat(T.translation, 3, axis=0), [[255, 0, 0], [0, 200, 0], [60, 60, 255]] * len(labels)
-    recording.log("world/landmarks/axes", rr.Arrows3D(origins=origins, vectors=axes, colors=colours), static=True)
+    recording.log(f"{entity}/axes", rr.Arrows3D(origins=origins, vectors=axes, colors=colours), static=True)
     known = [landmark for landmark in landmark_map if landmark.covariance is not None]
     if known:
         R = RigidTransform.concatenate([landmark.T_world_obj for landmark in known]).rotation.as_matrix()
         covariances = R @ np.stack([landmark.covariance[3:, 3:] for landmark in known]) @ R.mT
         half_sizes, q_xyzw = _ellipsoids(covariances)
         centers = [landmark.T_world_obj.translation for landmark in known]
-        ellipsoids = rr.Ellipsoids3D(centers=centers, half_sizes=half_sizes, quaternions=q_xyzw, colors=_PALETTE[4])
-        recording.log("world/landmarks/position_3_sigma", ellipsoids, static=True)
+        ellipsoids = rr.Ellipsoids3D(centers=centers, half_sizes=half_sizes, quaternions=q_xyzw, colors=colour)
+        recording.log(f"{entity}/position_3_sigma", ellipsoids, static=True)
 
 
 def _log_trajectory(

@@ -18,7 +18,9 @@ from fusion.simulate import SimulationOptions, simulate
 from poet_loc.cli import run as run_command
 from poet_loc.cli import view as view_command
 from poet_loc.cli.main import main
+from poet_loc.io.calibration_yaml import read_calibration
 from poet_loc.io.camera_poses_csv import read_camera_poses, write_camera_poses
+from poet_loc.io.landmarks_json import read_landmarks
 from poet_loc.io.log_folder import read_log
 from poet_loc.io.tum import read_tum
 
@@ -156,6 +158,22 @@ def test_localize_and_fuse_give_the_rows_of_the_run(run, clean_log, tmp_path):
         name = f"fuse/eskf/{measurements}"
         assert rmse_mm(summary(out)[name]) == pytest.approx(rmse_mm(whole[name]))
         assert "T_world_imu.tum" in files(out)
+
+
+def test_fuse_writes_what_it_estimated_beside_the_trajectory(clean_log, tmp_path):
+    asked = ["fuse", str(clean_log), "--out", str(tmp_path / "run"), "--no-pictures"]
+    assert main([*asked, "--estimate.extrinsics", "--estimate.time-offset", "--estimate.map", "unknown"]) == 0
+    before, after = (
+        read_calibration(clean_log / "calibration.yaml"),
+        read_calibration(tmp_path / "run/calibration.yaml"),
+    )
+    turned = (before.T_cam_imu.rotation.inv() * after.T_cam_imu.rotation).magnitude()
+    assert 0.0 < turned < np.radians(5.0)
+    assert after.timeshift_cam_imu_s != before.timeshift_cam_imu_s
+    assert after.camera == before.camera
+    found = read_landmarks(tmp_path / "run" / "landmarks.json")
+    assert {each.key for each in found} <= {each.key for each in read_landmarks(clean_log / "landmarks.json")}
+    assert sum(each.covariance is not None for each in found) == len(found) > 3
 
 
 def test_fuse_takes_camera_poses_from_the_mode_or_from_the_log(log, tmp_path):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -42,6 +43,7 @@ class FusedByHand:
     pose_covariances: NDArray | None
     gate: Gate | None
     runtime_s: float | None
+    calibrated: SimpleNamespace | None = None
 
 
 def _motion(stamps_ns: NDArray) -> Trajectory:

@@ -8,6 +8,7 @@ import sys
 from collections import defaultdict
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -15,6 +16,7 @@ import pytest
 from rerun.chunk import Chunk, RrdReader
 from scipy.spatial.transform import Rotation
 
+from poet_loc.core.geometry import make_pose
 from poet_loc.core.records import LandmarkMap
 from poet_loc.report import rerun_log
 from poet_loc.report.run_record import RunRecord
@@ -179,3 +181,27 @@ def test_covariances_of_landmarks_are_drawn(run_record: RunRecord, tmp_path: Pat
     rerun_log.write_recording(RunRecord(estimates=(), landmark_map=known), tmp_path / "map.rrd")
     half_sizes = column(read(tmp_path / "map.rrd")["world/landmarks/position_3_sigma"], "half_sizes").to_pylist()[0]
     np.testing.assert_allclose(half_sizes, [[0.6, 0.9, 1.2]], atol=1e-6)
+
+
+def test_the_map_is_drawn_as_given_and_as_found(run_record: RunRecord, tmp_path: Path) -> None:
+    (fused,) = run_record.fused
+    assert run_record.landmark_map is not None
+    shifted = [
+        make_pose(each.T_world_obj.rotation, each.T_world_obj.translation + 0.05) for each in run_record.landmark_map
+    ]
+    found = LandmarkMap(
+        tuple(
+            replace(each, T_world_obj=T, covariance=np.diag([0.01] * 6))
+            for each, T in zip(run_record.landmark_map, shifted, strict=True)
+        )
+    )
+    record = replace(run_record, fused=(replace(fused, calibrated=SimpleNamespace(landmark_map=found)),))
+    rerun_log.write_recording(record, tmp_path / "found.rrd")
+    chunks = read(tmp_path / "found.rrd")
+    entity = f"world/landmarks_found/{fused.name}"
+    before = np.array(column(chunks["world/landmarks"], "centers").to_pylist()[0])
+    after = np.array(column(chunks[entity], "centers").to_pylist()[0])
+    np.testing.assert_allclose(after - before, 0.05, atol=1e-6)
+    half_sizes = column(chunks[f"{entity}/position_3_sigma"], "half_sizes").to_pylist()[0]
+    np.testing.assert_allclose(half_sizes, 0.3, atol=1e-6)
+    assert "world/landmarks/position_3_sigma" not in chunks
