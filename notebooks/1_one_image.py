@@ -92,15 +92,26 @@ show(draw_attention(pixels, points.double().numpy(), weights.double().numpy()))
 
 # %%
 truth = scene.annotations
-errors = []
+names, errors, sigmas = [], [], []
 for number, (seen, _) in enumerate(found):
     for row, object_id in enumerate(seen.object_ids):
         same = np.flatnonzero((truth.image_ids == scene.image_ids[number]) & (truth.object_ids == object_id))
         if len(same) == 1:
             error = 1e3 * np.linalg.norm(seen.translations[row] - truth.T_cam_obj[int(same[0])].translation)
-            sigma = 1e3 * np.sqrt(np.trace(seen.covariances[row][3:, 3:]))
             errors.append(error)
-            print(f"image {number}, object {object_id:2d}: off by {error:5.1f} mm, believes {sigma:5.1f} mm")
+            sigmas.append(1e3 * np.sqrt(np.trace(seen.covariances[row][3:, 3:])))
+            names.append(f"{object_id}\n({number})")
+
+figure = Figure(figsize=(8.4, 2.6), layout="constrained")
+axes = figure.subplots()
+axes.bar(names, errors, color="#56B4E9", label="error")
+axes.errorbar(
+    names, [0.0] * len(names), [[0.0] * len(names), sigmas], fmt="none", ecolor="black", capsize=4, label="1σ"
+)
+axes.set_xlabel("object (image)")
+axes.set_ylabel("position error [mm]")
+axes.legend(frameon=False)
+figure
 
 # %% [markdown]
 # ## What must hold
@@ -109,6 +120,7 @@ for number, (seen, _) in enumerate(found):
 assert sum(len(seen.object_ids) for seen, _ in found) >= 3
 assert len(errors) >= 2
 assert np.median(errors) < 100.0  # objects stand half a metre to a metre away
+assert np.mean(np.array(errors) < 3.0 * np.array(sigmas)) > 0.8
 for seen, _ in found:
     assert np.all(seen.translations[:, 2] > 0.1)
     assert np.allclose(np.linalg.det(seen.rotations), 1.0)

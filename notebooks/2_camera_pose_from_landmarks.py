@@ -15,13 +15,13 @@
 #
 # $$T_{world,cam} = T_{world,obj}\; T_{cam,obj}^{-1}$$
 #
-# which is one **vote**. This notebook looks at one vote, two, many, at an outlier, and at the five
-# ways to make one pose
-# of them.
+# which is one **vote**. This notebook looks at one vote, two, many, at an outlier, and at the five ways to make one
+# pose of them.
 
 # %%
 # %matplotlib inline
 import numpy as np
+from matplotlib.figure import Figure
 from scipy.spatial.transform import RigidTransform, Rotation
 
 import poet_loc
@@ -60,10 +60,14 @@ def seen(ids: list[int], turn_deg: float = 0.0, seed: int = 0) -> RigidTransform
     return make_pose(Rotation.from_rotvec(axes) * T_true.rotation, T_true.translation)
 
 
+def solved(T_cam_obj: RigidTransform, ids: list[int], mode: str = "all") -> np.ndarray:
+    """Return where the solver puts the camera."""
+    return poet_loc.localize(log_of(T_cam_obj, ids), LocalizeOptions(mode=mode)).trajectory.T_world_body.translation[0]
+
+
 def miss_mm(T_cam_obj: RigidTransform, ids: list[int], mode: str = "all") -> float:
     """Return how far the solved camera is from the true one."""
-    found = poet_loc.localize(log_of(T_cam_obj, ids), LocalizeOptions(mode=mode)).trajectory.T_world_body
-    return float(1e3 * np.linalg.norm(found.translation[0] - T_world_cam.translation))
+    return float(1e3 * np.linalg.norm(solved(T_cam_obj, ids, mode) - T_world_cam.translation))
 
 
 # %% [markdown]
@@ -89,10 +93,9 @@ for n, misses in trials.items():
 
 # %% [markdown]
 # ## An outlier, and the modes
-# One of four objects is mistaken by half a turn. `all` averages it in; `out` and `prev` look for the
-# largest set of votes
-# that agree; `robust` weighs votes by covariance and refuses the one that contradicts; `best` is an oracle that picks
-# the vote nearest to the truth, a bar to measure against and no method.
+# One of four objects is mistaken by half a turn. `all` averages it in; `out` and `prev` look for the largest set of
+# votes that agree; `robust` weighs votes by covariance and refuses the one that contradicts; `best` is an oracle that
+# picks the vote nearest to the truth, a bar to measure against and no method.
 
 # %%
 ids = [1, 2, 3, 4]
@@ -102,6 +105,26 @@ spoiled = make_pose(spoiled.rotation * half_turn, spoiled.translation)
 misses = {mode: miss_mm(spoiled, ids, mode) for mode in ("all", "out", "prev", "best", "robust")}
 for mode, miss in misses.items():
     print(f"{mode:7s} {miss:7.1f} mm")
+
+# %% [markdown]
+# From above: each object's vote for where the camera is. The third is seen half a turn wrong, so it votes for the other
+# side of the table, and drags the mean of all with it.
+
+# %%
+votes = (landmark_map.T_world_obj * spoiled.inv()).translation
+figure = Figure(figsize=(8.4, 3.4), layout="constrained")
+axes = figure.subplots()
+objects = landmark_map.T_world_obj.translation
+axes.plot(*objects[:, :2].T, "D", color="black", markerfacecolor="white", label="landmarks")
+axes.plot(*votes[:, :2].T, "o", color="#56B4E9", label="votes")
+for number, (x, y, _) in zip(ids, votes, strict=True):
+    axes.annotate(str(number), (x, y), xytext=(4, 6 * number - 16), textcoords="offset points", fontsize=7)
+axes.plot(*T_world_cam.translation[:2], "*", color="black", markersize=12, label="true camera", zorder=1)
+for mode, colour in (("all", "#D55E00"), ("robust", "#009E73")):
+    axes.plot(*solved(spoiled, ids, mode)[:2], "x", color=colour, markersize=9, markeredgewidth=2, label=mode)
+axes.set(xlabel="x [m]", ylabel="y [m]", aspect="equal", ylim=(-0.8, 0.8))
+axes.legend(frameon=False, loc="upper left", bbox_to_anchor=(1.0, 1.0))
+figure
 
 # %% [markdown]
 # Who was refused is part of the result, as is the covariance of the pose.
@@ -120,6 +143,7 @@ assert exact < 1e-6
 assert 0.0 < turned <= np.radians(3.0) * distance * 1e3 + 1e-6
 rmse = {n: np.sqrt(np.mean(np.square(values))) for n, values in trials.items()}
 assert rmse[4] < rmse[2] < rmse[1]
+assert np.argmax(np.linalg.norm(votes - T_world_cam.translation, axis=1)) == 2
 assert misses["all"] > 5 * misses["out"]
 assert misses["all"] > 5 * misses["robust"]
 assert robust.result.voter_columns["refused"][0] == "3:0"

@@ -35,9 +35,8 @@ table = poet_loc.evaluate(*results)
 table
 
 # %% [markdown]
-# Rows are compared on the frames that all of them have; the coverage says how many of the ground-
-# truth frames those are.
-# The same table for a paper:
+# Rows are compared on the frames that all of them have; the coverage says how many of the ground-truth frames those
+# are. The same table for a paper:
 
 # %%
 print(table.tables[0].latex()[:400], "...")
@@ -50,9 +49,8 @@ table.plot("top view")
 
 # %% [markdown]
 # ## What must hold
-# Averaging in everything is worst where there are outliers, looking for agreement helps, and weighing
-# by covariance with a
-# memory helps more. (The published order all > out > prev > best needs three votes or more in most frames.)
+# Averaging in everything is worst where there are outliers, looking for agreement helps, and weighing by covariance with
+# a memory helps more. (The published order all > out > prev > best needs three votes or more in most frames.)
 
 # %%
 rmse = {

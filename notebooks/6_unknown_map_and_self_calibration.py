@@ -10,9 +10,8 @@
 # %% [markdown]
 # # 6 · Unknown map and self-calibration
 #
-# What if nobody measured where the objects stand, or where the camera sits on the IMU? Both can be
-# states of the filter.
-# An unknown map needs one anchor: the first landmark's pose defines the world, the others are taken in where they are
+# What if nobody measured where the objects stand, or where the camera sits on the IMU? Both can be states of the
+# filter. An unknown map needs one anchor: the first landmark's pose defines the world, the others are taken in where they are
 # first seen. What is estimated is switched on by `FuseOptions.estimate`.
 
 # %%
@@ -98,6 +97,13 @@ trusted = poet_loc.fuse(moved, poet_loc.FuseOptions(bias=white))
 calibrated = poet_loc.fuse(moved, poet_loc.FuseOptions(bias=white, estimate=Estimate(extrinsics=True)))
 print(f"wrong extrinsics trusted {rmse_mm(trusted):7.1f} mm, estimated {rmse_mm(calibrated):7.1f} mm")
 
+found = calibrated.calibrated
+off_before = np.linalg.norm(shifted.inv().translation - T_cam_imu.inv().translation)
+off_after = found.T_imu_cam.translation - T_cam_imu.inv().translation
+off_sigma = np.sqrt(np.diag(found.extrinsic_covariance))[3:]
+print(f"camera misplaced by {1e3 * off_before:.0f} mm before and {1e3 * np.linalg.norm(off_after):.0f} mm after;")
+print("error in sigma:", np.round(off_after / off_sigma, 1))
+
 # %% [markdown]
 # ## What must hold
 # Estimating costs little where the calibration is right and saves much where it is wrong, and the filter must stay
@@ -108,6 +114,9 @@ assert rmse_mm(known) < 15.0
 assert rmse_mm(corrected) < rmse_mm(believed)
 assert rmse_mm(unknown) < 40.0
 assert rmse_mm(calibrated) < rmse_mm(trusted)
+assert np.linalg.norm(off_after) < off_before
+assert np.all(np.abs(off_after) < 5 * off_sigma)
+assert len(unknown.calibrated.landmark_map) == len(log.landmark_map)
 for result in (corrected, unknown, calibrated):
     nees = float(np.nanmean(result.evaluation.rows[0].nees))
     print(f"NEES {nees:.2f}")
