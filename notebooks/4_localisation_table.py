@@ -49,8 +49,8 @@ table.plot("top view")
 
 # %% [markdown]
 # ## What must hold
-# Averaging in everything is worst where there are outliers, looking for agreement helps, and weighing by covariance with
-# a memory helps more. (The published order all > out > prev > best needs three votes or more in most frames.)
+# Averaging in everything is worst where there are outliers, looking for agreement helps, and weighing by covariance
+# with a memory helps more. (The published order all > out > prev > best needs three votes or more in most frames.)
 
 # %%
 rmse = {

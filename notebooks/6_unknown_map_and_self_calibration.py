@@ -11,8 +11,8 @@
 # # 6 · Unknown map and self-calibration
 #
 # What if nobody measured where the objects stand, or where the camera sits on the IMU? Both can be states of the
-# filter. An unknown map needs one anchor: the first landmark's pose defines the world, the others are taken in where they are
-# first seen. What is estimated is switched on by `FuseOptions.estimate`.
+# filter. An unknown map needs one anchor: the first landmark's pose defines the world, the others are taken in where
+# they are first seen. What is estimated is switched on by `FuseOptions.estimate`.
 
 # %%
 # %matplotlib inline
