@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 import torch
@@ -15,10 +16,13 @@ from poet_loc.data.packed import AugmentOptions, ObjectModels, PackedImages, Sam
 from poet_loc.model.losses import rotation_vector
 from poet_loc.model.options import NetworkOptions
 from poet_loc.model.poet import PoET, PoseOutput
-from poet_loc.model.queries import QueryBoxes, normalise_boxes, real_queries, stack_queries
+from poet_loc.model.queries import QueryBoxes, normalise_boxes, queries_from_detections, real_queries, stack_queries
 from poet_loc.model.small_detector import SmallDetector
 from poet_loc.train.detector import batch_numbers, detector_losses, image_batch, targets_of, validate_detector
 from poet_loc.train.steps import Losses, StepOptions, train_steps
+
+Boxes = Literal["bb", "gt"]
+"""Whose boxes are asked about: the detector's, or the true ones."""
 
 EMBEDDED = NetworkOptions(
     hidden_dim=128,
@@ -71,6 +75,15 @@ class Truth:
     """(K, 2) from normalised image coordinates to boxes."""
     classes: Tensor
     """(K,)"""
+
+    @property
+    def columns(self) -> tuple[Tensor, ...]:
+        """All fields in order."""
+        return self.t, self.R, self.axes, self.scale, self.classes
+
+    def rows(self, numbers: Tensor) -> Truth:
+        """Return some of the objects."""
+        return Truth(*(column[numbers] for column in self.columns))
 
 
 def jittered(boxes: np.ndarray, rng: np.random.Generator, share: float) -> np.ndarray:
@@ -221,9 +234,13 @@ def train_embedded(options: TrainEmbeddedOptions, detector: SmallDetector) -> Po
 
 @torch.no_grad()
 def predict(
-    module: PoET, images: PackedImages, count: int, models: ObjectModels
+    module: PoET, images: PackedImages, count: int, models: ObjectModels, boxes: Boxes = "gt"
 ) -> tuple[Tensor, Tensor, Tensor, Truth]:
-    """Return translations (K, 3), rotations (K, 3, 3), log variances (K, 6) and the truth, with ground-truth boxes."""
+    """Return translations (K, 3), rotations (K, 3, 3), log variances (K, 6) and the truth of the first images' objects.
+
+    With the true boxes, or with the detector's: of each object the best-scored detection of its class, missed ones left
+    out.
+    """
     module.eval()
     rows: list[tuple[Tensor, ...]] = []
     for start in range(0, min(count, len(images)), 10):
@@ -231,30 +248,33 @@ def predict(
             images.sample(n, np.random.default_rng(0)) for n in range(start, min(start + 10, count, len(images)))
         ]
         batch = image_batch(samples)
-        boxes = [sample.boxes for sample in samples]
-        queries, truth = queries_and_truth(samples, boxes, batch.size, module.options.queries, models)
-        output = module(batch, queries)
-        real = real_queries(queries)
-        known = output.translation_uncertainty is not None and output.rotation_uncertainty is not None
-        s = (
-            torch.cat([output.translation_uncertainty[real], output.rotation_uncertainty[real]], 1)
-            if known
-            else torch.zeros(len(truth.t), 6)
-        )
-        rows.append(
-            (
-                output.translation[real],
-                output.rotation[real],
-                s,
-                truth.t,
-                truth.R,
-                truth.axes,
-                truth.scale,
-                truth.classes,
-            )
-        )
+        features, limit = module.extract(batch), module.options.queries
+        queries, truth = queries_and_truth(samples, [s.boxes for s in samples], batch.size, limit, models)
+        image, query = torch.nonzero(real_queries(queries), as_tuple=True)
+        if boxes == "bb":
+            queries = queries_from_detections(module.detector.detect(features), batch.size, limit)
+            image, query, found = _answers(queries, samples)
+            truth = truth.rows(found)
+        output = module.poses(features, batch.mask, queries, batch.intrinsics)
+        parts = (output.translation_uncertainty, output.rotation_uncertainty)
+        known = [part[image, query] for part in parts if part is not None]
+        s = torch.cat(known, 1) if len(known) == 2 else torch.zeros(len(truth.t), 6)
+        rows.append((output.translation[image, query], output.rotation[image, query], s, *truth.columns))
     joined = [torch.cat(column) for column in zip(*rows)]
     return joined[0], joined[1], joined[2], Truth(*joined[3:])
+
+
+def _answers(queries: QueryBoxes, samples: list[Sample]) -> tuple[Tensor, Tensor, Tensor]:
+    """Return image, query and number among all objects (K,) of each object's best-scored detection of its class."""
+    pairs, number = [], 0
+    for image, sample in enumerate(samples):
+        for label in sample.classes.tolist():
+            same = torch.nonzero(queries.classes[image] == label)[:, 0]
+            if len(same):
+                pairs.append((image, int(same[queries.scores[image, same].argmax()]), number))
+            number += 1
+    columns = torch.tensor(pairs, dtype=torch.int64).reshape(-1, 3)
+    return columns[:, 0], columns[:, 1], columns[:, 2]
 
 
 def pose_figures(t: Tensor, R: Tensor, log_variance: Tensor, truth: Truth, models: ObjectModels) -> dict[str, float]:

@@ -8,15 +8,19 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 
-from poet_loc.data.packed import PackedImages, load_models, pack
+from poet_loc.data.packed import ObjectModels, PackedImages, load_models, pack
 from poet_loc.model.checkpoint import ModelConfig, save_model
 from poet_loc.model.poet import PoET
 from poet_loc.model.small_detector import SmallDetector, SmallDetectorOptions
-from poet_loc.train.calibration import scale_sigmas, temperatures
+from poet_loc.train.calibration import coverage, scale_sigmas, temperatures
 from poet_loc.train.detector import TrainDetectorOptions, train_detector
-from poet_loc.train.embedded import EMBEDDED, TrainEmbeddedOptions, pose_errors, predict, train_embedded
+from poet_loc.train.embedded import EMBEDDED, Boxes, TrainEmbeddedOptions, pose_errors, predict, train_embedded
 from poet_loc.train.steps import StepOptions
+
+Array = NDArray[np.float64]
+BOXES: tuple[Boxes, ...] = ("bb", "gt")
 
 
 @dataclass(frozen=True)
@@ -87,13 +91,14 @@ def history(folder: Path) -> dict[str, object]:
 
 
 def finish(network: PoET, world: Path, cache: Path, out: Path, source: dict[str, object]) -> Path:
-    """Calibrate a network on the validation images and write it in half precision."""
+    """Calibrate a network on the validation images, for the detector's boxes, and write it in half precision."""
     models = load_models(world / "models")
     val = PackedImages(pack(world / "val", cache / "val"), models)
-    t, R, log_variance, truth = predict(network.float(), val, len(val), models)
-    error = pose_errors(t, R, truth).double().numpy()
-    factors = temperatures(error, log_variance.double().numpy())
+    seen = {kind: _errors(network.float(), val, models, kind) for kind in BOXES}
+    used: Boxes = "bb" if len(seen["bb"][0]) >= _LEAST_DETECTED else "gt"
+    factors = temperatures(*seen[used])
     scale_sigmas(network, factors)
+    inside = {kind: coverage(e, s + 2.0 * np.log(factors)) for kind, (e, s) in seen.items() if len(e)}
     names = json.loads((world / "models" / "names.json").read_text())
     ids = tuple(sorted(int(key) for key in names))
     detector = network.detector
@@ -104,8 +109,23 @@ def finish(network: PoET, world: Path, cache: Path, out: Path, source: dict[str,
         ids,
         tuple(names[str(number)] for number in ids),
         image_size=(320, 240),
-        source={**source, "temperatures": [round(float(value), 4) for value in factors], "images": len(val)},
+        source={
+            **source,
+            "images": len(val),
+            "calibrated_for": used,
+            "temperatures": [round(float(value), 4) for value in factors],
+            "coverage": {kind: [round(float(share), 3) for share in shares] for kind, shares in inside.items()},
+        },
     )
     assert np.all(np.isfinite(factors))
     save_model(out, network, config, half=True)
     return out
+
+
+_LEAST_DETECTED = 100  # a detector that finds less has learned nothing yet: the true boxes then stand in for its own
+
+
+def _errors(network: PoET, images: PackedImages, models: ObjectModels, boxes: Boxes) -> tuple[Array, Array]:
+    """Return (K, 6) errors and log variances."""
+    t, R, log_variance, truth = predict(network, images, len(images), models, boxes)
+    return pose_errors(t, R, truth).double().numpy(), log_variance.double().numpy()

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -17,10 +17,12 @@ from poet_loc.core.records import ObjectPoses
 from poet_loc.data.packed import ObjectModels, load_models
 from poet_loc.io.bop import BopScene, read_bop_scene
 from poet_loc.io.frames_csv import read_frames
-from poet_loc.model.checkpoint import load_model
+from poet_loc.model.checkpoint import ModelConfig, load_model
 from poet_loc.model.embedded import EMBEDDED_WEIGHTS
+from poet_loc.model.poet import PoET
 from poet_loc.train.average_precision import mean_average_precision
-from poet_loc.train.video_poses import Boxes, poses_of_video, true_boxes
+from poet_loc.train.embedded import Boxes
+from poet_loc.train.video_poses import VideoPoses, poses_of_video, true_boxes
 
 Array = NDArray[np.float64]
 
@@ -37,6 +39,8 @@ class MeasureOptions:
     """Write object_poses_bb.csv and object_poses_gt.csv into the videos' folders, objects of the map alone."""
     least_visible: float = 0.1
     """Objects less visible than this share are not asked for."""
+    progress: bool = True
+    """Show a progress bar."""
 
 
 @dataclass(frozen=True)
@@ -83,9 +87,8 @@ def measure(options: MeasureOptions) -> Figures:
     parts: dict[Boxes, list[PoseScores]] = {"bb": [], "gt": []}
     detections: list[Array] = []
     truth: list[Array] = []
-    for folder in folders:
+    for folder, found in _with_bar(network, config, folders, options.progress):
         scene, frames = read_bop_scene(folder), read_frames(folder / "frames.csv")
-        found = poses_of_video(network, config, folder)
         for kind, poses in found.poses.items():
             parts[kind].append(score_poses(poses, scene, models, options.least_visible))
             if options.write_poses:
@@ -102,6 +105,17 @@ def measure(options: MeasureOptions) -> Figures:
         names,
         tuple(thing.object_id for thing in household_objects() if thing.silhouette_symmetric),
     )
+
+
+def _with_bar(
+    network: PoET, config: ModelConfig, folders: Sequence[Path], visible: bool
+) -> Iterator[tuple[Path, VideoPoses]]:
+    from poet_loc.data.render import progress_bar
+
+    with progress_bar("measuring", "videos", len(folders), visible) as advance:
+        for folder in folders:
+            yield folder, poses_of_video(network, config, folder)
+            advance(1)
 
 
 def _boxes_with_class(scene: BopScene, row: int, least_visible: float) -> Array:
@@ -221,8 +235,13 @@ def full_card(options: MeasureOptions, figures: Figures, log: Path) -> str:
         f"- Trained from scratch by `poet-loc train --preset embedded`: {stages}.",
         f"- Seeds: data 0, weights 0. {source.get('data', '')}".rstrip(),
         f"- {source.get('machine', '')}".rstrip(),
-        f"- Sigmas calibrated on {source.get('images', '?')} validation images; factors "
-        f"{source.get('temperatures', '?')} (translation x y z, rotation x y z).",
+        f"- Sigmas calibrated on {source.get('images', '?')} validation images for "
+        f"{'the true' if source.get('calibrated_for') == 'gt' else 'detected'} boxes; "
+        f"factors {source.get('temperatures', '?')} (translation x y z, rotation x y z).",
+        *(
+            f"- Within one sigma there, {kind} boxes: {_percents(100 * np.array(shares))}."
+            for kind, shares in source.get("coverage", {}).items()
+        ),
         "- Knows the rendered world alone: real photographs are another domain.",
         "",
         "## Test videos",

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Literal
 
 import cv2
 import numpy as np
@@ -22,9 +21,8 @@ from poet_loc.model.checkpoint import ModelConfig
 from poet_loc.model.heads import covariance_matrices
 from poet_loc.model.poet import PoET, PoseOutput
 from poet_loc.model.queries import queries_from_detections, real_queries
+from poet_loc.train.embedded import Boxes
 from poet_loc.train.steps import low_precision
-
-Boxes = Literal["bb", "gt"]
 
 
 @dataclass(frozen=True)

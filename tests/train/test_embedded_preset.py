@@ -11,7 +11,7 @@ from poet_loc.model.checkpoint import load_model
 from poet_loc.train import embedded_preset
 from poet_loc.train.embedded import EMBEDDED
 from poet_loc.train.embedded_preset import EmbeddedPresetOptions, train_preset
-from poet_loc.train.model_card import MeasureOptions, card_table, measure
+from poet_loc.train.model_card import MeasureOptions, card_table, full_card, measure
 from poet_loc.videos import VideoOptions, render_videos
 
 
@@ -28,6 +28,8 @@ def test_the_checkpoint_holds_detector_network_names_and_its_history(checkpoint)
     assert config.object_names[8] == "bowl"
     assert config.source["joint"]["step"] == 1
     assert len(config.source["temperatures"]) == 6
+    assert config.source["calibrated_for"] == "gt"  # after two steps the detector finds nothing
+    assert all(0.4 < share < 0.9 for share in config.source["coverage"]["gt"])
     assert checkpoint.stat().st_size < 20e6
 
 
@@ -48,7 +50,11 @@ def test_the_card_counts_every_object_that_was_asked_for(checkpoint, tmp_path):
     gt = figures.scores["gt"]
     assert len(gt.object_ids) == len(figures.scores["bb"].object_ids) > 0
     assert (gt.translation_m < 10).all()
+    card = full_card(MeasureOptions(tmp_path, checkpoint), figures, checkpoint.parent / "joint" / "log.jsonl")
+    assert "joint 1 steps" in card
+    assert "Within one sigma there, gt boxes" in card
     table = card_table(figures)
+    assert table in card
     assert "| **all** | gt |" in table
     assert all(f"| {figures.names[int(label)]} | gt |" in table for label in set(gt.object_ids))
     assert (tmp_path / "video_00" / "object_poses_gt.csv").exists()

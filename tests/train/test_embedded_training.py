@@ -10,8 +10,9 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
-from poet_loc.data.packed import NO_CHANGE
+from poet_loc.data.packed import NO_CHANGE, PackedImages, load_models, pack
 from poet_loc.data.render import RenderOptions, render
+from poet_loc.model.poet import PoET
 from poet_loc.model.small_detector import SmallDetector, SmallDetectorOptions
 from poet_loc.train.detector import TrainDetectorOptions, batch_numbers, train_detector
 from poet_loc.train.embedded import (
@@ -20,6 +21,7 @@ from poet_loc.train.embedded import (
     Truth,
     half_sines,
     pose_errors,
+    predict,
     robust_likelihood,
     train_embedded,
 )
@@ -83,6 +85,38 @@ def test_a_frozen_detector_stays_as_it_is(data, tmp_path):
     for name, value in trained.backbone[0].state_dict().items():
         torch.testing.assert_close(value, before[name])
     assert {"t_cm", "r_deg", "auc_add_s", "coverage_t"} <= set(rows(tmp_path)[-1])
+
+
+def test_predictions_with_the_detectors_boxes_are_those_with_true_boxes_where_it_finds_them(data):
+    """Of image 0 the detector sees everything exactly, and a worse box beside it; of image 1 nothing; of others all."""
+    torch.manual_seed(0)
+    models = load_models(data / "models")
+    images = PackedImages(pack(data / "val", data / "cache" / "val"), models)
+    network = PoET(TINY_POET, SmallDetector(TINY))
+    samples = [images.sample(n, np.random.default_rng(0)) for n in range(4)]
+
+    def exactly(features):
+        rows = []
+        for number, sample in enumerate(samples):
+            good = np.concatenate([sample.boxes, np.full((len(sample.boxes), 1), 0.9), sample.classes[:, None]], 1)
+            worse = good[:1] + [0, 0, 9, 9, -0.4, 0]
+            kinds = [np.concatenate([worse, good]) if len(good) < 10 else good, good[:0], good, good]
+            rows.append(torch.from_numpy(kinds[number]).float())
+        return rows
+
+    network.detector.detect = exactly
+    true, seen = (predict(network, images, 4, models, kind) for kind in ("gt", "bb"))
+    counts = [len(sample.classes) for sample in samples]
+    of_image = np.repeat(np.arange(4), counts)
+    kept = np.isin(of_image, [2, 3])
+    assert len(seen[0]) == sum(counts) - counts[1]
+    found = np.repeat([0, 2, 3], [counts[0], counts[2], counts[3]])
+    for one, other in zip(true[:3], seen[:3]):
+        np.testing.assert_allclose(other.numpy()[np.isin(found, [2, 3])], one.numpy()[kept], atol=1e-5)
+    for one, other in zip(true[3].columns, seen[3].columns):
+        np.testing.assert_array_equal(other.numpy(), one.numpy()[of_image != 1])
+    near = np.abs(seen[0].numpy() - true[0].numpy()[of_image != 1]).max(axis=1)
+    assert near[: counts[0]].max() < 0.05  # one more query changes what the others say a little, a worse box much more
 
 
 def test_a_pass_shows_every_image_once():
