@@ -22,6 +22,7 @@ COMMANDS = {
     "detect": "images, a video or a log become object poses with covariances",
     "train": "a pose network from images with poses",
     "calibrate": "scale a network's variances until held-out errors agree with them",
+    "ablation": "what each part of the pose network is worth: the paper's rows and ours, equally trained",
     "export": "write a pose network as ONNX or OpenVINO",
     "localize": "object poses and a landmark map become camera poses",
     "fuse": "camera or object poses and a motion source become a trajectory with its sigmas",

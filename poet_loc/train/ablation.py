@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+from poet_loc.core.input_error import InputError
 from poet_loc.data.packed import PackedImages, load_models, pack
+from poet_loc.io.whole_folder import write_whole_file
 from poet_loc.model.embedded import load_embedded
 from poet_loc.model.options import NetworkOptions
 from poet_loc.model.poet import PoET
@@ -53,41 +56,69 @@ class AblationOptions:
     """Train every row of the ablation on the frozen detector of the embedded network."""
 
     data: Path
-    """BOP data set with models/ and the splits train and val."""
+    """BOP data set with models/ and the splits train and val (poet-loc render images)."""
     out: Path
-    """Folder of caches and checkpoints; rows that are there go on where they stopped."""
-    rows: tuple[str, ...] = ()
-    """Names of rows; empty: all."""
+    """Folder of caches, checkpoints and figures.json; what is there is not done again."""
+    rows: tuple[str, ...] = tuple(PAPER_ROWS)
+    """Names of rows; those of ours besides: Embedded, without RoI features, all octaves of the box code, without spread
+    reference points, translation direct, rotation in camera axes, encoder over all maps."""
     steps: int = 1000
     """Optimiser steps of each row."""
     batch: int = 16
+    """Images per step."""
     val_images: int = 400
+    """Validation images that the figures come from."""
     seed: int = 0
+    """Seed of weights and of the order of images, the same for every row."""
+    max_steps: int | None = None
+    """Stop, resumable, after so many steps of each row in this stretch."""
 
 
 def ablate(options: AblationOptions) -> dict[str, dict[str, float]]:
-    """Train the rows and return their validation figures (see embedded.pose_figures)."""
+    """Train the rows as far as the options say and return their validation figures (see embedded.pose_figures).
+
+    Figures are kept in figures.json beside the checkpoints, by row; a row that went on since is measured anew.
+    Raises InputError for a row that does not exist.
+    """
+    networks = PAPER_ROWS | OUR_ROWS
+    for name in options.rows:
+        if name not in networks:
+            raise InputError(f"the ablation has no row '{name}'", fix=f"one of {', '.join(networks)}")
     models = load_models(options.data / "models")
     val = PackedImages(pack(options.data / "val", options.out / "packed" / "val"), models)
-    figures = {}
-    for name, network_options in (PAPER_ROWS | OUR_ROWS).items():
-        if options.rows and name not in options.rows:
-            continue
-        detector = load_embedded()[0].detector
-        assert isinstance(detector, SmallDetector)
-        folder = options.out / name.replace(" ", "_")
-        steps = StepOptions(folder, options.steps, options.batch, learning_rate=5e-4, seed=options.seed)
-        training = TrainEmbeddedOptions(
-            options.data, options.out / "packed", steps, network_options, val_images=options.val_images
-        )
-        trained: PoET = train_embedded(training, detector)
-        figures[name] = pose_figures(*predict(trained, val, options.val_images, models), models)
-    return figures
+    kept = options.out / "figures.json"
+    figures = json.loads(kept.read_text()) if kept.exists() else {}
+    for name in options.rows:
+        trained, cpu_minutes, step = _trained(options, name, networks[name])
+        if figures.get(name, {}).get("step") != step:
+            found = pose_figures(*predict(trained, val, options.val_images, models), models)
+            figures[name] = {"step": step, "cpu_minutes": cpu_minutes, **found}
+            write_whole_file(kept, [json.dumps(figures, indent=1) + "\n"])
+    return {name: figures[name] for name in networks if name in options.rows}
+
+
+def _trained(options: AblationOptions, name: str, network: NetworkOptions) -> tuple[PoET, float, float]:
+    """Return a row's network, and the CPU minutes and steps that it took."""
+    detector = load_embedded()[0].detector
+    assert isinstance(detector, SmallDetector)
+    steps = StepOptions(
+        options.out / name.replace(" ", "_"),
+        options.steps,
+        options.batch,
+        learning_rate=5e-4,
+        seed=options.seed,
+        max_steps=options.max_steps,
+    )
+    training = TrainEmbeddedOptions(options.data, options.out / "packed", steps, network, val_images=options.val_images)
+    trained = train_embedded(training, detector)
+    last = json.loads((steps.out / "log.jsonl").read_text().splitlines()[-1])
+    return trained, last["cpu_minutes"], last["step"]
 
 
 def ablation_table(figures: dict[str, dict[str, float]]) -> str:
-    """Return the figures as Markdown."""
-    lines = ["| network | t cm, median | r deg, median | AUC ADD-S |", "|---|--:|--:|--:|"]
+    """Return the figures as Markdown; medians, with true boxes."""
+    lines = ["| network | steps | CPU min | t cm | r deg | AUC ADD-S |", "|---|--:|--:|--:|--:|--:|"]
     for name, row in figures.items():
-        lines.append(f"| {name} | {row['t_cm']:.2f} | {row['r_deg']:.1f} | {row['auc_add_s']:.1f} |")
+        spent = f"{row['step']:.0f} | {row['cpu_minutes']:.1f}"
+        lines.append(f"| {name} | {spent} | {row['t_cm']:.2f} | {row['r_deg']:.1f} | {row['auc_add_s']:.1f} |")
     return "\n".join(lines)

@@ -6,13 +6,15 @@ import copy
 import json
 import math
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Generic, TypeVar
 
 import torch
 from torch import Tensor, nn
+
+from poet_loc.data.render import progress_bar
 
 
 @dataclass(frozen=True)
@@ -103,7 +105,7 @@ def train_steps(
     mean: dict[str, float] = {}
     low = low_precision(options.precision)
     last = options.steps if options.max_steps is None else min(options.steps, step + options.max_steps)
-    while step < last:
+    for _ in _shown(range(step, last), options):
         torch.manual_seed((options.seed << 32) + step)  # dropout of a resumed run is that of an uninterrupted one
         for group in optimizer.param_groups:
             group["lr"] = learning_rate_at(step, options)
@@ -130,6 +132,14 @@ def train_steps(
             _log(options.out / "log.jsonl", {"step": step, "cpu_minutes": minutes, **mean, **found})
             _save(options.out / "checkpoint.pt", module, averaged, optimizer, step, minutes)
     return averaged.module
+
+
+def _shown(numbers: range, options: StepOptions) -> Iterator[int]:
+    """Yield numbers under a bar."""
+    with progress_bar("training", f"steps of {options.out.name}", options.steps, already=numbers.start) as advance:
+        for number in numbers:
+            yield number
+            advance(1)
 
 
 def _resume(
