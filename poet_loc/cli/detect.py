@@ -23,6 +23,9 @@ class Arguments:
     out: Path | None = None
     """Folder to write: object_poses.csv, boxes.csv, bop_results.csv, results.json, summary.json, overlays/.  Without
     it a log gets its own object_poses.csv and boxes.csv, and every other command can read it."""
+    recording: bool = False
+    """With --out: also recording.rrd for rerun (poet-loc view OUT): the images with boxes, axes, 3-sigma outlines of the
+    positions, and, in up to sixty of them, the points that the network looked at."""
     name: str = ""
     """Without --out: the log gets object_poses_NAME.csv instead."""
     overwrite: bool = False
@@ -36,14 +39,37 @@ def execute(arguments: Arguments) -> None:
     from poet_loc.io.object_poses_csv import read_object_poses
 
     if arguments.out is None:
-        if arguments.options.overlays:
-            raise InputError("overlays need a folder of their own", fix="give --out FOLDER")
+        if arguments.options.overlays or arguments.recording:
+            raise InputError("overlays and recordings need a folder of their own", fix="give --out FOLDER")
         path = detect_in_log(arguments.source, arguments.name, arguments.options, arguments.overwrite, progress=True)
         print(f"{path}: {len(read_object_poses(path))} object poses")
         return
     if arguments.name:
         raise InputError("--name is for a log's own detections", fix="leave out --name or --out")
     out = detect(arguments.source, arguments.out, arguments.options, arguments.overwrite, progress=True)
+    if arguments.recording:
+        _record(arguments.source, out, arguments.options)
     summary = json.loads((out / "summary.json").read_text())
     skipped = f", {len(summary['skipped'])} images skipped" if summary["skipped"] else ""
     print(f"{out}: {summary['detections']} object poses in {summary['images']} images{skipped}")
+
+
+def _record(source: Path, out: Path, options: DetectOptions) -> None:
+    from poet_loc.core.records import Camera
+    from poet_loc.detect.attention import attention_of_images
+    from poet_loc.detect.image_source import open_images
+    from poet_loc.io.boxes_csv import read_boxes
+    from poet_loc.io.object_poses_csv import read_object_poses
+    from poet_loc.report.rerun_log_images import Attention, write_image_recording
+    from poet_loc.report.seen_images import SeenImages
+
+    images = open_images(source, options.stamps, options.rate)
+    if not images.files:
+        raise InputError(
+            "a recording takes image files, not a video", path=source, fix="extract its frames, or leave it"
+        )
+    intrinsics = options.intrinsics or images.intrinsics
+    camera = None if intrinsics is None else Camera(intrinsics)
+    seen = SeenImages(images.stamps_ns, images.files, read_boxes(out / "boxes.csv"))
+    looked = {stamp: Attention(*found) for stamp, found in attention_of_images(source, options).items()}
+    write_image_recording(out / "recording.rrd", seen, read_object_poses(out / "object_poses.csv"), camera, looked)

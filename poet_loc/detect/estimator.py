@@ -111,15 +111,23 @@ class Estimator:
         """Return what is in each picture."""
         start = time.perf_counter()
         self._compare_cameras(pictures[0])
-        given = None if self.intrinsics is None else torch.tensor([self.intrinsics] * len(pictures))
-        batch = batch_images([to_tensor(p.pixels) for p in pictures], given, self.multiple).to(self.device)
-        features = self.network.extract(batch)
-        queries = self._queries(pictures, batch, features)
+        batch, features = self.features(pictures)
+        queries = self.queries(pictures, batch, features)
         output = self.engine.poses(features, batch.mask, queries, batch.intrinsics)
         seconds = (time.perf_counter() - start) / len(pictures)
         return [self._sighting(picture, output, i, batch, seconds) for i, picture in enumerate(pictures)]
 
-    def _queries(self, pictures: Sequence[Picture], batch: ImageBatch, features: Features) -> QueryBoxes:
+    def features(self, pictures: Sequence[Picture]) -> tuple[ImageBatch, Features]:
+        """Return pictures as a batch, and the detector's maps of it."""
+        given = None if self.intrinsics is None else torch.tensor([self.intrinsics] * len(pictures))
+        batch = batch_images([to_tensor(p.pixels) for p in pictures], given, self.multiple).to(self.device)
+        return batch, self.network.extract(batch)
+
+    def queries(self, pictures: Sequence[Picture], batch: ImageBatch, features: Features) -> QueryBoxes:
+        """Return the boxes to ask about: those of the file that the options name, else the detector's.
+
+        Raises InputError for a class beyond the network's.
+        """
         nothing = torch.zeros(0, 6)
         if self.options.boxes is not None:
             found = [self.boxes.get(Path(p.name).name, nothing) for p in pictures]
