@@ -24,8 +24,8 @@ class Arguments:
     """Folder to write: object_poses.csv, boxes.csv, bop_results.csv, results.json, summary.json, overlays/.  Without
     it a log gets its own object_poses.csv and boxes.csv, and every other command can read it."""
     recording: bool = False
-    """With --out: also recording.rrd for rerun (poet-loc view OUT): the images with boxes, axes, 3-sigma outlines of the
-    positions, and, in up to sixty of them, the points that the network looked at."""
+    """With --out: also recording.rrd for rerun (poet-loc view OUT): the images with boxes, axes, 3-sigma outlines of
+    the positions, and, in up to sixty of them, the points that the network looked at."""
     name: str = ""
     """Without --out: the log gets object_poses_NAME.csv instead."""
     overwrite: bool = False
@@ -35,6 +35,7 @@ class Arguments:
 
 def execute(arguments: Arguments) -> None:
     """Detect and say what came out."""
+    from poet_loc.detect.image_source import VIDEO_SUFFIXES
     from poet_loc.detect.stage import detect, detect_in_log
     from poet_loc.io.object_poses_csv import read_object_poses
 
@@ -46,6 +47,8 @@ def execute(arguments: Arguments) -> None:
         return
     if arguments.name:
         raise InputError("--name is for a log's own detections", fix="leave out --name or --out")
+    if arguments.recording and arguments.source.suffix.lower() in VIDEO_SUFFIXES:
+        raise InputError("a recording takes image files, not a video", path=arguments.source, fix="extract its frames")
     out = detect(arguments.source, arguments.out, arguments.options, arguments.overwrite, progress=True)
     if arguments.recording:
         _record(arguments.source, out, arguments.options)
@@ -64,10 +67,6 @@ def _record(source: Path, out: Path, options: DetectOptions) -> None:
     from poet_loc.report.seen_images import SeenImages
 
     images = open_images(source, options.stamps, options.rate)
-    if not images.files:
-        raise InputError(
-            "a recording takes image files, not a video", path=source, fix="extract its frames, or leave it"
-        )
     intrinsics = options.intrinsics or images.intrinsics
     camera = None if intrinsics is None else Camera(intrinsics)
     seen = SeenImages(images.stamps_ns, images.files, read_boxes(out / "boxes.csv"))
