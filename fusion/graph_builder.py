@@ -2,56 +2,38 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import gtsam
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import block_diag
 
 from fusion import eskf
-from fusion.graph_factors import (
-    EXTRINSICS,
-    Detection,
-    ImuChain,
-    Model,
-    bias_factor,
-    core_to_filter,
-    imu_bias,
-    imu_bias_key,
-    imu_factor,
+from fusion.graph_factors import Detection, Model, bias_factor, measurement_factor
+from fusion.graph_model import bias_step
+from fusion.graph_motion import MotionChain
+from fusion.graph_variables import (
+    Variable,
+    errors_of,
     joint_prior,
-    measurement_factor,
+    keyframe_variables,
     object_bias_key,
-    object_key,
-    pose3,
-    pose_key,
-    pose_to_filter,
-    put_core,
-    velocity_key,
+    object_variable,
+    static_variables,
 )
 from fusion.measurements import OBJECT_POSE
-from fusion.nav_state import CORE, EXTRINSIC_ROTATION, OBJECT_SIZE, OBJECTS, VELOCITY, StateLayout
+from fusion.nav_state import OBJECT_SIZE, StateLayout
 from fusion.options import Graph
 
 Array = NDArray[np.float64]
 
-
-@dataclass
-class BiasChain:
-    """One bias of one object over time: its newest variable, or what is known before there is one."""
-
-    kind: int
-    mean: Array
-    sigma: Array
-    stamp_ns: int
-    key: int | None = None
+_ANYWHERE = np.repeat([10.0, 100.0], 3)  # rad, m: an object whose pose nothing is known of
 
 
 @dataclass(frozen=True)
 class BiasModel:
-    """The Gauss-Markov model of the object biases, read from the filter's memory."""
+    """The Gauss-Markov model of the object biases, as the filter's memory has it."""
 
     values: Array
 
@@ -61,26 +43,45 @@ class BiasModel:
 
     def jumped(self, kind: int) -> Array:
         """Return the 1-sigma (6,) after a jump."""
-        return float(self.values[eskf.BIAS_JUMP]) * self.stationary(kind)
+        return float(self.values[kind * eskf.BIAS_MODEL_SIZE + eskf.BIAS_JUMP]) * self.stationary(kind)
 
-    def decay(self, kind: int, seconds: float) -> float:
-        """Return how much of a bias is left after some seconds."""
-        return float(np.exp(-seconds / self.values[kind * eskf.BIAS_MODEL_SIZE + eskf.BIAS_TAU]))
+    def step(self, kind: int, mean: Array, seconds: float) -> tuple[Array, Array]:
+        """Return factor and 1-sigma, each (6,), of what a bias does in some seconds (`eskf.decay_biases`)."""
+        left, sigma = np.empty(6), np.empty(6)
+        bias_step(self.values, kind, mean, seconds, left, sigma)
+        return left, sigma
+
+
+@dataclass
+class BiasChain:
+    """One bias of one object over time: its newest variable, or what is known before there is one."""
+
+    kind: int
+    variable: Variable
+    """Key of the newest variable, -1 before there is one; places of the object's bias."""
+    sigma: Array
+    stamp_ns: int
+
+    @property
+    def begun(self) -> bool:
+        """Whether there is a variable."""
+        return self.variable.key >= 0
 
 
 class GraphBuilder:
-    """Collects what a new keyframe adds: factors, initial values and the time of every variable.
+    """Collects what a new keyframe adds: factors, initial values, and the keyframe at which each variable came.
 
-    A keyframe is pose, velocity and IMU bias. Extrinsics and object poses are one variable each where they are
-    estimated. An object's bias has a variable per keyframe that sees the object.
+    Object poses, where they are estimated, and extrinsics, time offset and gravity are one variable each. An object's
+    bias has a variable per keyframe that sees the object. x is the nominal array from which new variables start.
     """
 
-    def __init__(self, layout: StateLayout, x: Array, bias_model: Array, chain: ImuChain, options: Graph) -> None:
-        self.layout, self.bias_model, self.imu = layout, BiasModel(bias_model.copy()), chain
-        self.model = Model(layout, x.copy(), options)
-        self.keyframe, self.stamp_ns = -1, 0
-        self._bias_count = 0
+    def __init__(self, layout: StateLayout, x: Array, bias_model: Array, chain: MotionChain, options: Graph) -> None:
+        self.layout, self.bias_model, self.chain = layout, BiasModel(bias_model.copy()), chain
+        self.model = Model(layout, x.copy(), chain.with_imu, options)
+        self.keyframe, self.stamp_ns, self.x = -1, 0, x.copy()
         self.chains: dict[tuple[int, int], BiasChain] = {}
+        self._statics: dict[int, Variable] = {}
+        self._bias_count = 0
         self._clear()
 
     def _clear(self) -> None:
@@ -94,123 +95,126 @@ class GraphBuilder:
         return added
 
     @property
-    def static_keys(self) -> list[int]:
-        """Keys of extrinsics and object poses where they are estimated."""
-        objects = [object_key(k) for k in range(self.layout.n_objects)] if self.layout.objects else []
-        return [EXTRINSICS] * self.layout.extrinsics + objects
+    def newest(self) -> list[Variable]:
+        """The newest keyframe's variables and those that last."""
+        return keyframe_variables(self.keyframe, self.chain.with_imu) + self.lasting
 
     @property
-    def lasting_keys(self) -> list[int]:
-        """Keys that must not fall out of a smoother's window."""
-        return self.static_keys + [chain.key for chain in self.chains.values() if chain.key is not None]
+    def statics(self) -> list[Variable]:
+        """Extrinsics, time offset, gravity and object poses as far as they are estimated."""
+        return list(self._statics.values())
 
-    def start(self, stamp_ns: int, x: Array, P: Array) -> None:
-        """Begin a graph with the filter's state as prior; object biases begin at their stationary sigma."""
+    @property
+    def lasting(self) -> list[Variable]:
+        """What must not be marginalised: statics, objects, each object's newest biases."""
+        return [*self._statics.values(), *(chain.variable for chain in self.chains.values() if chain.begun)]
+
+    @property
+    def newest_biases(self) -> list[tuple[int, int]]:
+        """Key (-1: none yet) and stamp of each object bias's newest variable, in the order of the state."""
+        kinds, objects = range(self.layout.bias_kinds), range(self.layout.n_objects)
+        chains = (self.chains[k, kind] for kind in kinds for k in objects)
+        return [(chain.variable.key, chain.stamp_ns) for chain in chains]
+
+    def start(self, stamp_ns: int, x: Array, P: Array, known: Array, start_from: Array | None = None) -> None:
+        """Begin a graph with the filter's state as prior; object biases begin at their stationary sigma.
+
+        known (K,) tells which object poses the filter knows; the others come in when they are first seen. Initial
+        values are those of x, or of start_from.
+        """
         self._clear()
-        self._add_variables(stamp_ns, x)
-        keys = [pose_key(self.keyframe), velocity_key(self.keyframe), imu_bias_key(self.keyframe)]
-        blocks, indices = [core_to_filter(x[:9].reshape(3, 3))], list(range(CORE))
-        if self.layout.extrinsics:
-            keys.append(EXTRINSICS)
-            self._add_pose(EXTRINSICS, x, EXTRINSIC_ROTATION, "extrinsics", 0, blocks, indices)
-        for k in range(self.layout.n_objects if self.layout.objects else 0):
-            keys.append(object_key(k))
-            self._add_pose(object_key(k), x, OBJECTS + OBJECT_SIZE * k, "objects", k, blocks, indices)
-        to_gtsam = np.linalg.inv(block_diag(*blocks))
-        covariance = to_gtsam @ P[np.ix_(indices, indices)] @ to_gtsam.T
-        sizes = [6, 3, 6] + [6] * (len(keys) - 3)
-        self.graph.add(joint_prior(keys, sizes, self.values, 0.5 * (covariance + covariance.T)))
-        self.chains = {
-            (k, kind): BiasChain(kind, np.zeros(6), self.bias_model.stationary(kind), stamp_ns)
-            for k in range(self.layout.n_objects)
-            for kind in range(self.layout.bias_kinds)
-        }
+        self.x, layout = x.copy() if start_from is None else start_from.copy(), self.layout
+        self._statics = {variable.key: variable for variable in static_variables(layout)}
+        for k in range(layout.n_objects if layout.objects else 0):
+            if known[k] > 0.0:
+                self._statics[object_variable(layout, k).key] = object_variable(layout, k)
+        self._add_keyframe(stamp_ns)
+        for variable in self._statics.values():
+            self._add(variable)
+        first = keyframe_variables(self.keyframe, self.chain.with_imu) + list(self._statics.values())
+        self.graph.add(joint_prior(first, x, P))
+        self.chains = {}
+        for k in range(layout.n_objects):
+            for kind in range(layout.bias_kinds):
+                place = Variable(-1, errors_of(layout, "biases", k, kind), layout.nominal_bias(k, kind).start)
+                self.chains[k, kind] = BiasChain(kind, place, self.bias_model.stationary(kind), stamp_ns)
 
-    def _add_pose(
-        self, key: int, x: Array, at: int, name: str, index: int, blocks: list[Array], indices: list[int]
-    ) -> None:
-        self.values.insert(key, pose3(x, at))
-        self.keyframes[key] = self.keyframe
-        blocks.append(pose_to_filter(x[at : at + 9].reshape(3, 3)))
-        part = self.layout.error_slice(name, index)
-        indices.extend(range(part.start, part.stop))
+    def _add(self, variable: Variable) -> None:
+        variable.insert(self.values, self.x)
+        self.keyframes[variable.key] = self.keyframe
 
-    def _add_variables(self, stamp_ns: int, x: Array) -> None:
+    def _add_keyframe(self, stamp_ns: int) -> None:
         self.keyframe, self.stamp_ns = self.keyframe + 1, stamp_ns
-        k = self.keyframe
-        self.values.insert(pose_key(k), pose3(x, 0))
-        self.values.insert(velocity_key(k), x[VELOCITY : VELOCITY + 3])
-        self.values.insert(imu_bias_key(k), imu_bias(x))
-        for key in (pose_key(k), velocity_key(k), imu_bias_key(k)):
-            self.keyframes[key] = k
+        for variable in keyframe_variables(self.keyframe, self.chain.with_imu):
+            self._add(variable)
 
-    def add_keyframe(
-        self, stamp_ns: int, x: Array, before: Array, between: Iterable[Detection], bias: gtsam.imuBias.ConstantBias
-    ) -> None:
-        """Add a keyframe that starts from x, the IMU up to it (summed at a bias) and the detections on the way."""
-        for detection in between:
-            self.add_detection(detection)
-        summed = self.imu.preintegrate(self.stamp_ns, stamp_ns, bias)
-        self.graph.add(imu_factor(self.keyframe, self.keyframe + 1, summed))
-        predicted = x.copy()
-        state = summed.predict(gtsam.NavState(pose3(before, 0), before[VELOCITY : VELOCITY + 3]), bias)
-        put_core(predicted, state.pose(), state.velocity(), bias)
-        self._add_variables(stamp_ns, predicted)
+    def add_keyframe(self, stamp_ns: int, x: Array | None = None) -> None:
+        """Add a keyframe and the motion up to it; it starts from x, or from what the motion predicts."""
+        link, predicted = self.chain.link(self.keyframe, self.stamp_ns, stamp_ns, self.x)
+        self.graph.add(link)
+        self.x = predicted if x is None else x.copy()
+        self._add_keyframe(stamp_ns)
 
-    def add_detection(self, detection: Detection) -> None:
-        """Add a detection to the newest keyframe."""
-        kinds = self.layout.bias_kinds if detection.kind == OBJECT_POSE else 0
-        biases = [self._bias_here(detection.object, kind) for kind in range(kinds)]
-        self.graph.add(measurement_factor(detection, self.keyframe, biases, self.model))
+    def add_detections(self, detections: Iterable[Detection]) -> None:
+        """Add detections to the newest keyframe."""
+        for d in detections:
+            kinds = range(self.layout.bias_kinds if d.kind == OBJECT_POSE else 0)
+            if self.layout.objects and d.kind == OBJECT_POSE:
+                self._meet(d.object)
+            biases = [self._bias_here(d.object, kind) for kind in kinds]
+            self.graph.add(measurement_factor(d, self.keyframe, biases, self.model))
+
+    def place_new_objects(self, x: Array) -> None:
+        """Let objects that the graph has not met start where they stand in a nominal array."""
+        for k in range(self.layout.n_objects if self.layout.objects else 0):
+            variable = object_variable(self.layout, k)
+            if variable.key not in self._statics:
+                self.x[variable.at : variable.at + OBJECT_SIZE] = x[variable.at : variable.at + OBJECT_SIZE]
+
+    def _meet(self, k: int) -> None:
+        """Add an object's pose where it is seen for the first time."""
+        variable = object_variable(self.layout, k)
+        if variable.key not in self._statics:
+            self._statics[variable.key] = variable
+            self._add(variable)
+            anywhere = gtsam.noiseModel.Diagonal.Sigmas(_ANYWHERE)
+            self.graph.addPriorPose3(variable.key, self.values.atPose3(variable.key), anywhere)
 
     def forget(self, k: int, kind: int, half: int) -> None:
         """Let an object's bias of rotation (half 0) or translation (1) be another from the newest keyframe on."""
         chain, part = self.chains[k, kind], slice(3 * half, 3 * half + 3)
-        jumped = self.bias_model.jumped(kind)
-        if chain.key is None:
-            self._age(chain)
-            chain.mean[part], chain.sigma[part] = 0.0, jumped[part]
-            return
-        phi, sigma = self._step(chain)
-        phi[part], sigma[part] = 0.0, jumped[part]
-        self._add_bias(chain, phi, np.maximum(sigma, 1e-9))
+        phi, sigma = self.step(chain)
+        phi[part], sigma[part] = 0.0, self.bias_model.jumped(kind)[part]
+        if chain.begun:
+            self._add_bias(chain, phi, np.maximum(sigma, 1e-6))
+        else:
+            chain.sigma, chain.stamp_ns = np.hypot(phi * chain.sigma, sigma), self.stamp_ns
 
     def _bias_here(self, k: int, kind: int) -> int:
         """Return the key of an object's bias at the newest keyframe."""
         chain = self.chains[k, kind]
-        if chain.key is None:
-            self._age(chain)
+        phi, sigma = self.step(chain)
+        if not chain.begun:
+            chain.sigma, chain.stamp_ns = np.hypot(phi * chain.sigma, sigma), self.stamp_ns
             self._add_bias(chain, None, chain.sigma)
-        elif chain.stamp_ns < self.stamp_ns:
-            phi, sigma = self._step(chain)
-            if phi[0] < 1.0:
-                self._add_bias(chain, phi, sigma)
-        assert chain.key is not None
-        return chain.key
+        elif sigma.any():
+            self._add_bias(chain, phi, sigma)
+        return chain.variable.key
 
-    def _step(self, chain: BiasChain) -> tuple[Array, Array]:
-        phi = self.bias_model.decay(chain.kind, (self.stamp_ns - chain.stamp_ns) * 1e-9)
-        return np.full(6, phi), np.sqrt(1.0 - phi * phi) * self.bias_model.stationary(chain.kind)
-
-    def _age(self, chain: BiasChain) -> None:
-        phi, sigma = self._step(chain)
-        chain.mean, chain.sigma, chain.stamp_ns = phi * chain.mean, np.hypot(phi * chain.sigma, sigma), self.stamp_ns
+    def step(self, chain: BiasChain) -> tuple[Array, Array]:
+        """Return factor and 1-sigma, each (6,), from a bias's newest variable to the newest keyframe."""
+        at, seconds = chain.variable.at, (self.stamp_ns - chain.stamp_ns) * 1e-9
+        return self.bias_model.step(chain.kind, self.x[at : at + 6], seconds)
 
     def _add_bias(self, chain: BiasChain, phi: Array | None, sigma: Array) -> None:
         """Add a bias variable at the newest keyframe: with a prior, or a step from the one before."""
-        key = object_bias_key(self._bias_count)
+        before, at = chain.variable, chain.variable.at
+        variable = Variable(object_bias_key(self._bias_count), before.errors, at)
         self._bias_count += 1
         if phi is None:
-            self.graph.addPriorVector(key, chain.mean, gtsam.noiseModel.Diagonal.Sigmas(sigma))
+            self.graph.addPriorVector(variable.key, np.zeros(6), gtsam.noiseModel.Diagonal.Sigmas(sigma))
         else:
-            assert chain.key is not None
-            self.graph.add(bias_factor(chain.key, key, phi, sigma))
-            chain.mean = phi * chain.mean
-        self.values.insert(key, chain.mean)
-        self.keyframes[key] = self.keyframe
-        chain.key, chain.stamp_ns = key, self.stamp_ns
-
-    def set_bias_means(self, means: Mapping[tuple[int, int], Array]) -> None:
-        """Take the newest estimates of the biases as starting values of the next variables."""
-        for which, mean in means.items():
-            self.chains[which].mean = mean
+            self.x[at : at + 6] *= phi
+            self.graph.add(bias_factor(before.key, variable.key, phi, sigma))
+        chain.variable, chain.stamp_ns = variable, self.stamp_ns
+        self._add(variable)

@@ -1,12 +1,8 @@
-"""What the graph is made of: IMU, measurements, wandering biases and priors as gtsam factors.
-
-Keys: x pose T_world_imu, v velocity, b IMU bias (gtsam's order: accelerometer, gyroscope) per keyframe; e T_imu_cam;
-o T_world_obj per object; c one object's bias over a stretch of time.
-"""
+"""Measurements and object biases as gtsam factors."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -15,168 +11,52 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import block_diag
 
-from fusion.graph_steps import SECONDS, detection_error, imu_between
-from fusion.measurements import CAMERA_POSE, OBJECT_POSE
-from fusion.nav_state import (
-    ACCEL_BIAS,
-    CORE,
-    EXTRINSIC_ROTATION,
-    GYRO_BIAS,
-    OBJECT_SIZE,
-    OBJECTS,
-    VELOCITY,
-    StateLayout,
+from fusion.graph_model import (
+    BIAS_COLUMNS,
+    EXTRINSIC_COLUMNS,
+    OBJECT_COLUMNS,
+    OFFSET_COLUMN,
+    VELOCITY_COLUMNS,
+    detection_error,
 )
-from fusion.options import Gap, Graph
-from poet_loc.core.records import ImuNoise, ImuSamples
+from fusion.graph_variables import EXTRINSICS, OFFSET, object_key, pose3, pose_key, velocity_key
+from fusion.measurements import CAMERA_POSE, OBJECT_POSE
+from fusion.nav_state import EXTRINSIC_ROTATION, OBJECT_SIZE, OBJECTS, TIME_OFFSET, VELOCITY, StateLayout
+from fusion.options import Graph
 
 Array = NDArray[np.float64]
-Ints = NDArray[np.int64]
-
-EXTRINSICS = gtsam.symbol("e", 0)
-_SMALLEST_DENSITY = 1e-8  # a noise density of zero has no information matrix
-_SMALLEST_VARIANCE = 1e-14  # nor has an exact prior
-
-
-def pose_key(k: int) -> int:
-    """Return the key of keyframe k's pose."""
-    return int(gtsam.symbol("x", k))
-
-
-def velocity_key(k: int) -> int:
-    """Return the key of keyframe k's velocity."""
-    return int(gtsam.symbol("v", k))
-
-
-def imu_bias_key(k: int) -> int:
-    """Return the key of keyframe k's IMU bias."""
-    return int(gtsam.symbol("b", k))
-
-
-def object_key(k: int) -> int:
-    """Return the key of an object's pose."""
-    return int(gtsam.symbol("o", k))
-
-
-def object_bias_key(count: int) -> int:
-    """Return the key of one stretch of an object's bias."""
-    return int(gtsam.symbol("c", count))
-
-
-def pose3(x: Array, at: int) -> gtsam.Pose3:
-    """Return the pose that stands in the nominal array."""
-    return gtsam.Pose3(gtsam.Rot3(x[at : at + 9].reshape(3, 3)), x[at + 9 : at + 12])
-
-
-def put_pose3(x: Array, at: int, T: gtsam.Pose3) -> None:
-    """Write a pose into the nominal array."""
-    x[at : at + 9] = T.rotation().matrix().ravel()
-    x[at + 9 : at + 12] = T.translation()
-
-
-def imu_bias(x: Array) -> gtsam.imuBias.ConstantBias:
-    """Return the IMU bias that stands in the nominal array."""
-    return gtsam.imuBias.ConstantBias(x[ACCEL_BIAS : ACCEL_BIAS + 3], x[GYRO_BIAS : GYRO_BIAS + 3])
-
-
-def put_core(x: Array, T: gtsam.Pose3, velocity: Array, bias: gtsam.imuBias.ConstantBias) -> None:
-    """Write pose, velocity and IMU bias into the nominal array."""
-    put_pose3(x, 0, T)
-    x[VELOCITY : VELOCITY + 3] = velocity
-    x[GYRO_BIAS : GYRO_BIAS + 3] = bias.gyroscope()
-    x[ACCEL_BIAS : ACCEL_BIAS + 3] = bias.accelerometer()
-
-
-def core_to_filter(R_world_imu: Array) -> Array:
-    """Return the (15, 15) matrix that turns gtsam's [pose 6, velocity 3, bias 6] tangent into the filter's error state.
-
-    Pose3 measures its translation in body axes, the filter in world axes; gtsam's bias is [accelerometer, gyroscope].
-    """
-    J = np.zeros((CORE, CORE))
-    J[:3, :3] = J[6:9, 6:9] = np.eye(3)
-    J[3:6, 3:6] = R_world_imu
-    J[9:12, 12:15] = J[12:15, 9:12] = np.eye(3)
-    return J
-
-
-def pose_to_filter(R: Array) -> Array:
-    """Return the (6, 6) matrix from a Pose3's tangent to [rotation, translation in the axes around it]."""
-    return block_diag(np.eye(3), R)
+Error = Callable[[gtsam.CustomFactor, gtsam.Values, "list[Array] | None"], Array]
 
 
 @dataclass(frozen=True)
-class ImuChain:
-    """Makes the factor between two keyframes."""
+class Detection:
+    """One measurement as the graph takes it: rows first..first+size of [rotation, translation], after a keyframe."""
 
-    stamps_ns: Ints
-    values: Array
-    """(N, 6) angular velocity and specific force."""
-    noise: ImuNoise
-    gap: Gap
-
-    @classmethod
-    def of(cls, imu: ImuSamples, noise: ImuNoise, gap: Gap) -> ImuChain:
-        """Return the chain of a log's IMU."""
-        return cls(imu.stamps_ns, np.hstack([imu.angular_velocity, imu.specific_force]), noise, gap)
-
-    def preintegrate(
-        self, start: int, end: int, bias: gtsam.imuBias.ConstantBias
-    ) -> gtsam.PreintegratedCombinedMeasurements:
-        """Return the IMU between two stamps, integrated at a bias.
-
-        A gap inside raises the densities of the whole stretch so far that it explains what the gap may have held.
-        """
-        size = np.searchsorted(self.stamps_ns, [start, end]) @ [-1, 1] + 2
-        steps = np.empty((size, 7))
-        biases = np.concatenate([bias.gyroscope(), bias.accelerometer()])
-        count = imu_between(self.stamps_ns, self.values, start, end, biases, steps)
-        gaps = steps[:count, 0][steps[:count, 0] > self.gap.longest_s]
-        spread = float(gaps @ gaps) / ((end - start) * 1e-9) if len(gaps) else 0.0
-        summed = gtsam.PreintegratedCombinedMeasurements(self._parameters(spread), bias)
-        for step in steps[:count]:
-            summed.integrateMeasurement(step[4:7], step[1:4], step[0])
-        return summed
-
-    def _parameters(self, gap_s: float) -> gtsam.PreintegrationCombinedParams:
-        """Every covariance is set: gtsam takes the identity for those that are not."""
-        params = gtsam.PreintegrationCombinedParams.MakeSharedU(9.81)
-        gyro = self.noise.gyroscope_noise_density**2 + gap_s * self.gap.angular_rate**2
-        accel = self.noise.accelerometer_noise_density**2 + gap_s * self.gap.acceleration**2
-        floor, identity = _SMALLEST_DENSITY**2, np.eye(3)
-        params.setGyroscopeCovariance((gyro + floor) * identity)
-        params.setAccelerometerCovariance((accel + floor) * identity)
-        params.setBiasOmegaCovariance((self.noise.gyroscope_random_walk**2 + floor) * identity)
-        params.setBiasAccCovariance((self.noise.accelerometer_random_walk**2 + floor) * identity)
-        params.setIntegrationCovariance(1e-10 * identity)
-        return params
+    kind: int
+    object: int
+    first: int
+    size: int
+    rotation: Array
+    translation: Array
+    covariance: Array
+    """(6, 6) of both."""
+    motion: Array
+    """(MOTION_SIZE,) from the keyframe to the measurement's stamp."""
+    rate: Array
+    """(3,) angular velocity at its stamp, rad/s."""
+    moved: bool
+    """Its stamp is not the keyframe's."""
 
 
-def imu_factor(first: int, second: int, summed: gtsam.PreintegratedCombinedMeasurements) -> gtsam.CombinedImuFactor:
-    """Return the factor between two keyframes."""
-    return gtsam.CombinedImuFactor(
-        pose_key(first),
-        velocity_key(first),
-        pose_key(second),
-        velocity_key(second),
-        imu_bias_key(first),
-        imu_bias_key(second),
-        summed,
-    )
+@dataclass(frozen=True)
+class Model:
+    """What every measurement's factor reads: layout, the map and extrinsics as they are known, the kernel."""
 
-
-def joint_prior(
-    keys: Sequence[int], sizes: Sequence[int], values: gtsam.Values, covariance: Array
-) -> gtsam.NonlinearFactor:
-    """Return a Gaussian on several variables at their values; covariance in the order of keys, in gtsam's tangents."""
-    covariance = covariance + _SMALLEST_VARIANCE * np.eye(len(covariance))
-    scale = 1.0 / np.sqrt(np.diag(covariance))
-    root = np.linalg.cholesky(covariance * np.outer(scale, scale))
-    whitener = np.split(np.linalg.solve(root, np.diag(scale)), np.cumsum(sizes)[:-1], axis=1)
-    unit = gtsam.noiseModel.Diagonal.Sigmas(np.ones(len(covariance)))
-    terms = list(zip(keys, whitener, strict=True))
-    together = gtsam.GaussianFactorGraph()
-    together.add(gtsam.GaussianConditional(terms, 1, np.zeros(len(covariance)), unit))
-    return gtsam.LinearContainerFactor(gtsam.JacobianFactor(together), values.extract(list(keys)))
+    layout: StateLayout
+    x: Array
+    """A nominal array; scratch but for what is known."""
+    with_imu: bool
+    options: Graph
 
 
 def bias_factor(first: int, second: int, phi: Array, sigma: Array) -> gtsam.NonlinearFactor:
@@ -199,31 +79,6 @@ def robust(options: Graph, covariance: Array) -> gtsam.noiseModel.Base:
     return gtsam.noiseModel.Robust.Create(kernel.Create(options.kernel_width), gaussian)
 
 
-@dataclass(frozen=True)
-class Detection:
-    """One measurement as the graph takes it: rows first..first+size of [rotation, translation], after a keyframe."""
-
-    kind: int
-    object: int
-    first: int
-    size: int
-    rotation: Array
-    translation: Array
-    covariance: Array
-    motion: Array
-    """(MOTION_SIZE,) from the keyframe to the measurement's stamp."""
-
-
-@dataclass(frozen=True)
-class Model:
-    """What every measurement's factor reads: layout, the map and extrinsics as they are known, the kernel."""
-
-    layout: StateLayout
-    x: Array
-    """A nominal array; scratch but for what is known."""
-    options: Graph
-
-
 def measurement_factor(
     detection: Detection, keyframe: int, biases: Sequence[int], model: Model
 ) -> gtsam.NonlinearFactor:
@@ -231,10 +86,12 @@ def measurement_factor(
 
     biases are the keys of the object's biases.
     """
-    native = detection.kind == CAMERA_POSE and detection.size == 6 and not model.layout.extrinsics
-    if native and detection.motion[SECONDS] == 0.0:
+    layout, whole = model.layout, detection.size == 6 and not detection.moved
+    if detection.kind == CAMERA_POSE and whole and not layout.extrinsics and not layout.time_offset:
         return _camera_pose_prior(detection, keyframe, model)
-    return _compiled_factor(detection, keyframe, biases, model)
+    keys, error = _compiled_error(detection, keyframe, biases, model)
+    rows = slice(detection.first, detection.first + detection.size)
+    return gtsam.CustomFactor(robust(model.options, detection.covariance[rows, rows]), keys, error)
 
 
 def _camera_pose_prior(detection: Detection, keyframe: int, model: Model) -> gtsam.NonlinearFactor:
@@ -243,25 +100,54 @@ def _camera_pose_prior(detection: Detection, keyframe: int, model: Model) -> gts
     T_imu_cam = pose3(model.x, EXTRINSIC_ROTATION)
     T_world_imu = gtsam.Pose3(gtsam.Rot3(R_m), detection.translation).compose(T_imu_cam.inverse())
     A = T_imu_cam.AdjointMap() @ block_diag(np.eye(3), R_m.T)
-    return gtsam.PriorFactorPose3(
-        pose_key(keyframe), T_world_imu, robust(model.options, A @ detection.covariance @ A.T)
+    noise = robust(model.options, A @ detection.covariance @ A.T)
+    return gtsam.PriorFactorPose3(pose_key(keyframe), T_world_imu, noise)
+
+
+def error_at(d: Detection, x: Array, layout: StateLayout) -> tuple[Array, Array]:
+    """Return a measurement's error (predicted minus measured) and Jacobian at a keyframe's nominal array."""
+    T_world_obj = pose3(x, OBJECTS + OBJECT_SIZE * d.object).matrix() if d.kind == OBJECT_POSE else np.eye(4)
+    kinds = range(layout.bias_kinds if d.kind == OBJECT_POSE else 0)
+    e, J = detection_error(
+        d.kind,
+        d.object,
+        d.first,
+        d.size,
+        d.rotation,
+        d.translation,
+        d.rate,
+        d.motion,
+        pose3(x, 0).matrix(),
+        x[VELOCITY : VELOCITY + 3],
+        pose3(x, EXTRINSIC_ROTATION).matrix(),
+        T_world_obj,
+        float(x[TIME_OFFSET]),
+        np.array([x[layout.nominal_bias(d.object, kind)] for kind in kinds]).reshape(-1, 6),
+        x.copy(),
+        layout.as_integers(),
     )
+    return np.asarray(e), np.asarray(J)
 
 
-def _compiled_factor(detection: Detection, keyframe: int, biases: Sequence[int], model: Model) -> gtsam.NonlinearFactor:
-    """Return a factor on residual and Jacobian of `fusion.measurements`."""
-    d, layout, x = detection, model.layout, model.x
+def _compiled_error(d: Detection, keyframe: int, biases: Sequence[int], model: Model) -> tuple[list[int], Error]:
+    """Return the keys of a measurement, and its residual and Jacobian as gtsam calls them."""
+    layout, x = model.layout, model.x
     integers = layout.as_integers()
-    moved, free_object = d.motion[SECONDS] > 0.0, layout.objects and d.kind == OBJECT_POSE
-    pose, velocity, landmark = pose_key(keyframe), velocity_key(keyframe), object_key(d.object)
+    pose, velocity, landmark = pose_key(keyframe), velocity_key(keyframe), object_key(max(d.object, 0))
+    with_velocity = model.with_imu and (d.moved or layout.time_offset)
+    free_object = layout.objects and d.kind == OBJECT_POSE
     at = OBJECTS + OBJECT_SIZE * d.object
     known_object = pose3(x, at).matrix() if d.kind == OBJECT_POSE else np.eye(4)
-    known_extrinsics, still = pose3(x, EXTRINSIC_ROTATION).matrix(), np.zeros(3)
+    known_extrinsics, known_offset, still = pose3(x, EXTRINSIC_ROTATION).matrix(), float(x[TIME_OFFSET]), np.zeros(3)
     bias = np.zeros((len(biases), 6))
-    columns = [(pose, slice(0, 6), True), (velocity, slice(6, 9), moved), (EXTRINSICS, slice(9, 15), layout.extrinsics)]
-    columns += [(landmark, slice(15, 21), free_object)]
-    columns += [(key, slice(21 + 6 * i, 27 + 6 * i), True) for i, key in enumerate(biases)]
-    keys, blocks = [key for key, _, used in columns if used], [part for _, part, used in columns if used]
+    columns = {pose: 0}
+    columns |= {velocity: VELOCITY_COLUMNS} if with_velocity else {}
+    columns |= {EXTRINSICS: EXTRINSIC_COLUMNS} if layout.extrinsics else {}
+    columns |= {landmark: OBJECT_COLUMNS} if free_object else {}
+    columns |= {OFFSET: OFFSET_COLUMN} if layout.time_offset else {}
+    columns |= {key: BIAS_COLUMNS + 6 * i for i, key in enumerate(biases)}
+    sizes = {velocity: 3, OFFSET: 1}
+    parts = [slice(first, first + sizes.get(key, 6)) for key, first in columns.items()]
 
     def error(_: gtsam.CustomFactor, values: gtsam.Values, H: list[Array] | None) -> Array:
         for i, key in enumerate(biases):
@@ -273,19 +159,20 @@ def _compiled_factor(detection: Detection, keyframe: int, biases: Sequence[int],
             d.size,
             d.rotation,
             d.translation,
+            d.rate,
             d.motion,
             values.atPose3(pose).matrix(),
-            values.atVector(velocity) if moved else still,
+            values.atVector(velocity) if with_velocity else still,
             values.atPose3(EXTRINSICS).matrix() if layout.extrinsics else known_extrinsics,
             values.atPose3(landmark).matrix() if free_object else known_object,
+            values.atVector(OFFSET)[0] if layout.time_offset else known_offset,
             bias,
             x,
             integers,
         )
         if H is not None:
-            for i, part in enumerate(blocks):
+            for i, part in enumerate(parts):
                 H[i] = J[:, part]
         return np.asarray(e)
 
-    rows = slice(d.first, d.first + d.size)
-    return gtsam.CustomFactor(robust(model.options, d.covariance[rows, rows]), keys, error)
+    return list(columns), error

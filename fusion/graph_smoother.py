@@ -1,39 +1,128 @@
-"""The fixed-lag smoother: gtsam's incremental one, and its newest state handed back to the filter."""
+"""The fixed-lag smoother, and its newest state handed back to the filter.
+
+gtsam's IncrementalFixedLagSmoother leaves the order of elimination to a heuristic and so eliminates its whole window
+anew for every keyframe. Here ISAM2 is told to eliminate in order of time: a new keyframe touches the end of the window
+only, the oldest variables are leaves, and the joint covariance of the newest stands in the root.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Sequence
 
 import gtsam
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import block_diag
+from scipy.linalg import block_diag, solve_triangular
 
 from fusion.eskf import POSITION_ONLY, ROTATION_ONLY
 from fusion.graph_builder import GraphBuilder
-from fusion.graph_factors import (
-    EXTRINSICS,
-    Detection,
-    core_to_filter,
-    imu_bias,
-    imu_bias_key,
-    object_key,
-    pose_key,
-    pose_to_filter,
-    put_core,
-    put_pose3,
-    velocity_key,
-)
-from fusion.graph_keyframes import Keyframe, Walk
-from fusion.graph_steps import move_on
+from fusion.graph_factors import Detection
+from fusion.graph_walk import Keyframe, Walk
 from fusion.memory import Memory
-from fusion.nav_state import CORE, EXTRINSIC_ROTATION, OBJECT_SIZE, OBJECTS
 from fusion.options import Graph
-from fusion.prepare import Problem
 
 Array = NDArray[np.float64]
 
-_LOOSE = 3  # keyframes at the end of the window that an ordinary update may order anew
+
+class FixedLagSmoother:
+    """Keyframes of the last seconds as variables, older ones marginalised; cost per keyframe is constant."""
+
+    def __init__(self, builder: GraphBuilder, options: Graph) -> None:
+        self.builder, self._options = builder, options
+        self._window = max(1, round(options.lag_s * options.keyframe_rate_hz))
+        self._isam = gtsam.ISAM2(isam_parameters(options))
+        self._came: dict[int, int] = {}
+        self._lasting: set[int] = set()
+        self._first = builder.keyframe + 1
+
+    def start(self, keyframe: Keyframe, walk: Walk) -> None:
+        """Begin at a keyframe with the filter's state as prior."""
+        m = walk.memory
+        self.builder.start(keyframe.stamp_ns, m.x, m.P, m.known)
+        self._update()
+
+    def extend(self, keyframe: Keyframe, walk: Walk) -> None:
+        """Add a keyframe and what was measured since the last one; correct the filter's state with the result."""
+        builder = self.builder
+        builder.place_new_objects(walk.memory.x)
+        builder.add_detections(detections(builder, walk, keyframe.between))
+        builder.add_keyframe(keyframe.stamp_ns)
+        forget_biases(builder, keyframe)
+        builder.add_detections(detections(builder, walk, keyframe.at))
+        self._update()
+        self._write_back(walk.memory)
+
+    def _update(self) -> None:
+        """Take in what is new and let the oldest go; variables are eliminated in order of time, lasting ones last."""
+        newest, every = self.builder.keyframe, self._options.relinearize_every
+        graph, values, came = self.builder.take()
+        lasting = {variable.key for variable in self.builder.lasting}
+        for key in self._lasting - lasting:
+            self._came[key] = newest - 1  # until now it was eliminated behind all keyframes before this one
+        self._came |= came
+        self._lasting = lasting
+        anew = every > 0 and (newest - self._first) % every == every - 1
+        if not self._eliminate(graph, values, came, anew, anew):
+            self._eliminate(gtsam.NonlinearFactorGraph(), gtsam.Values(), {}, True)
+        self._let_go(newest - self._window)
+
+    def _eliminate(
+        self,
+        graph: gtsam.NonlinearFactorGraph,
+        values: gtsam.Values,
+        came: dict[int, int],
+        whole: bool,
+        anew: bool = False,
+    ) -> bool:
+        """Eliminate the end of the window or all of it, in order of time; tell whether that order is certain.
+
+        COLAMD takes as many groups as it orders variables. Where ISAM2 eliminates more keyframes than have a group of
+        their own (it does where cliques have merged, and all of them where most are concerned), the order of the oldest
+        is left to chance, and they would be no leaves when they go.
+        """
+        newest, recent = self.builder.keyframe, 3 if self.builder.chain.with_imu else 9
+        again = [key for key, k in self._came.items() if whole or k > newest - recent or key in self._lasting]
+        oldest = max(self._first, newest + 2 - len(again))
+        groups, old, certain = gtsam.KeyGroupMap(), gtsam.KeyList(), 0
+        for key, keyframe in self._came.items():
+            lasts = key in self._lasting
+            groups.insert2(key, newest - oldest + 1 if lasts else max(0, keyframe - oldest))
+            certain += lasts or keyframe >= oldest
+        for key in again:
+            if key not in came:
+                old.push_back(key)
+        result = self._isam.update(graph, values, [], groups, None, old, anew)
+        return whole or int(result.getVariablesReeliminated()) <= certain
+
+    def _let_go(self, until: int) -> None:
+        leaving = sorted((k, key) for key, k in self._came.items() if k <= until and key not in self._lasting)
+        keys = gtsam.KeyList()
+        for _, key in leaving:
+            keys.push_back(key)
+            del self._came[key]
+        if leaving:
+            self._isam.marginalizeLeaves(keys)
+
+    def _write_back(self, m: Memory) -> None:
+        """Give the filter's memory the newest state and the joint covariance of all that it holds."""
+        builder, variables = self.builder, self.builder.newest
+        keys = [variable.key for variable in variables]
+        estimate = self._isam.calculateEstimate(keys)
+        for variable in variables:
+            variable.read(estimate, builder.x)
+            variable.read(estimate, m.x)
+        at = [i for variable in variables for i in variable.errors]
+        blocks = {variable.key: variable.to_filter(builder.x) for variable in variables}
+        added = dict.fromkeys(at, 0.0)
+        for (k, kind), chain in builder.chains.items():
+            if chain.begun:
+                phi, sigma = builder.step(chain)
+                m.x[builder.layout.nominal_bias(k, kind)] *= phi
+                blocks[chain.variable.key] = np.diag(phi)
+                added |= dict(zip(chain.variable.errors, sigma**2, strict=True))
+        J = block_diag(*blocks.values())
+        P = J @ joint_covariance(self._isam, keys) @ J.T + np.diag([added[i] for i in at])
+        m.P[np.ix_(at, at)] = 0.5 * (P + P.T)
 
 
 def isam_parameters(options: Graph) -> gtsam.ISAM2Params:
@@ -41,133 +130,44 @@ def isam_parameters(options: Graph) -> gtsam.ISAM2Params:
     params = gtsam.ISAM2Params()
     params.setFactorization("QR")
     params.setRelinearizeThreshold(options.relinearize)
-    params.relinearizeSkip = 1_000_000_000
+    params.relinearizeSkip = 1_000_000_000  # only where it is asked for
     params.findUnusedFactorSlots = True
     return params
 
 
-def detections(walk: Walk, problem: Problem, which: range, keyframe_ns: int, biases: Array) -> Iterator[Detection]:
-    """Yield the measurements that passed the gate, with the motion since a keyframe integrated at the IMU's biases."""
-    measured = problem.measurements
-    for i in which:
-        decision = int(walk.decisions[i])
-        if decision == 0:
-            continue
-        first = 0 if decision & ROTATION_ONLY else 3
-        size = (3 if decision & POSITION_ONLY else 0) + 3 - first
-        yield Detection(
-            int(measured.kinds[i]),
-            int(measured.objects[i]),
-            first,
-            size,
-            walk.rotations[i],
-            measured.translations[i],
-            walk.covariances[i],
-            move_on(walk.imu_stamps, walk.imu_values, keyframe_ns, int(measured.stamps_ns[i]), biases),
-        )
+def joint_covariance(tree: gtsam.ISAM2 | gtsam.GaussianBayesTree, keys: Sequence[int]) -> Array:
+    """Return the joint marginal covariance of variables in this order, by QR: gtsam's own way takes Cholesky."""
+    R, _ = tree.jointBayesNet(keys, gtsam.EliminateQR).matrix()
+    root = solve_triangular(R, np.eye(len(R)))
+    return np.asarray(root @ root.T)
 
 
-class FixedLagSmoother:
-    """Keyframes of the last seconds as variables, older ones marginalised; cost per keyframe is constant."""
+def forget_biases(builder: GraphBuilder, keyframe: Keyframe) -> None:
+    """Let the object biases jump that the filter has forgotten at a keyframe."""
+    for i, half in np.argwhere(keyframe.forgotten):
+        kind, k = divmod(int(i), builder.layout.n_objects)
+        builder.forget(k, kind, int(half))
 
-    def __init__(self, builder: GraphBuilder, options: Graph) -> None:
-        self.builder = builder
-        self._window = max(2, round(options.lag_s * options.keyframe_rate_hz))
-        self._relinearize_every = options.relinearize_every
-        self._smoother = gtsam.ISAM2(isam_parameters(options))
-        self._passing: dict[int, int] = {}
-        self._lasting: set[int] = set()
-        self._updates = 0
 
-    def start(self, keyframe: Keyframe, walk: Walk) -> None:
-        """Begin at a keyframe with the filter's state as prior."""
-        m = walk.memory
-        self.builder.start(keyframe.stamp_ns, m.x, m.P)
-        self._first = self.builder.keyframe
-        self._update()
-        self._bias = imu_bias(m.x)
-        self._x = m.x.copy()
+def detections(builder: GraphBuilder, walk: Walk, which: range) -> list[Detection]:
+    """Return the measurements of a keyframe that passed the gate, as the filter used them."""
+    decided = ((i, int(walk.columns.decisions[i])) for i in which)
+    return [detection_of(builder, walk, i, builder.stamp_ns, builder.x, passed) for i, passed in decided if passed]
 
-    def extend(self, keyframe: Keyframe, walk: Walk, problem: Problem) -> None:
-        """Add a keyframe and what was measured since the last one; correct the filter's state with the result."""
-        builder, x = self.builder, walk.memory.x
-        gyro_accel = np.concatenate([self._bias.gyroscope(), self._bias.accelerometer()])
-        between = detections(walk, problem, keyframe.between, builder.stamp_ns, gyro_accel)
-        builder.add_keyframe(keyframe.stamp_ns, x, self._x, between, self._bias)
-        for i, half in np.argwhere(keyframe.forgotten):
-            kind, k = divmod(int(i), builder.layout.n_objects)
-            builder.forget(k, kind, int(half))
-        for detection in detections(walk, problem, keyframe.at, keyframe.stamp_ns, gyro_accel):
-            builder.add_detection(detection)
-        self._update()
-        self.write_back(walk.memory)
 
-    def _update(self) -> None:
-        """Take in what is new, eliminated in order of time with the lasting variables last; let the oldest go.
-
-        In that order a new keyframe touches the end of the window only, and the oldest variables are leaves.
-        """
-        builder, newest = self.builder, self.builder.keyframe
-        graph, values, keyframes = builder.take()
-        self._passing |= keyframes
-        lasting = set(builder.lasting_keys)
-        for key in self._lasting - lasting:
-            self._passing[key] = newest - 1  # until now it was eliminated behind all keyframes before this one
-        self._lasting = lasting
-        self._updates += 1
-        whole = self._relinearize_every > 0 and self._updates % self._relinearize_every == 0
-        oldest = max(self._first, newest - (self._window if whole else _LOOSE))
-        groups, again = gtsam.KeyGroupMap(), gtsam.KeyList()
-        for key, keyframe in self._passing.items():
-            if key in lasting:
-                groups.insert2(key, newest - oldest + 1)
-            else:
-                groups.insert2(key, max(0, keyframe - oldest))
-            if whole and key not in keyframes:
-                again.push_back(key)
-        self._smoother.update(graph, values, [], groups, None, again, whole)
-        self._let_go(newest - self._window)
-
-    def _let_go(self, until: int) -> None:
-        leaving = sorted((k, key) for key, k in self._passing.items() if k <= until and key not in self._lasting)
-        if leaving:
-            keys = gtsam.KeyList()
-            for _, key in leaving:
-                keys.push_back(key)
-                del self._passing[key]
-            self._smoother.marginalizeLeaves(keys)
-
-    def write_back(self, m: Memory) -> None:
-        """Give the filter's memory the newest state and the joint covariance of all that it holds."""
-        builder, smoother, layout = self.builder, self._smoother, self.builder.layout
-        k = builder.keyframe
-        self._bias = smoother.calculateEstimateConstantBias(imu_bias_key(k))
-        T_world_imu = smoother.calculateEstimatePose3(pose_key(k))
-        put_core(m.x, T_world_imu, smoother.calculateEstimateVector(velocity_key(k)), self._bias)
-        keys = [pose_key(k), velocity_key(k), imu_bias_key(k)]
-        blocks, indices, added = [core_to_filter(m.x[:9].reshape(3, 3))], list(range(CORE)), [np.zeros(CORE)]
-
-        def include(key: int, block: Array, noise: Array, part: slice) -> None:
-            keys.append(key)
-            blocks.append(block)
-            added.append(noise)
-            indices.extend(range(part.start, part.stop))
-
-        statics = [(EXTRINSICS, EXTRINSIC_ROTATION, layout.error_slice("extrinsics"))] if layout.extrinsics else []
-        if layout.objects:
-            for j in range(layout.n_objects):
-                statics.append((object_key(j), OBJECTS + OBJECT_SIZE * j, layout.error_slice("objects", j)))
-        for key, at, part in statics:
-            put_pose3(m.x, at, smoother.calculateEstimatePose3(key))
-            include(key, pose_to_filter(m.x[at : at + 9].reshape(3, 3)), np.zeros(6), part)
-        for (j, kind), chain in builder.chains.items():
-            if chain.key is not None:
-                chain.mean = smoother.calculateEstimateVector(chain.key)
-                phi, sigma = builder._step(chain)
-                m.x[layout.nominal_bias(j, kind)] = phi * chain.mean
-                include(chain.key, np.diag(phi), sigma**2, layout.error_slice("biases", j, kind))
-        J = block_diag(*blocks)
-        joint = smoother.jointMarginalCovariance(keys).fullMatrix()
-        P = J @ joint @ J.T + np.diag(np.concatenate(added))
-        m.P[np.ix_(indices, indices)] = 0.5 * (P + P.T)
-        self._x = m.x.copy()
+def detection_of(builder: GraphBuilder, walk: Walk, i: int, keyframe_ns: int, x: Array, passed: int) -> Detection:
+    """Return those rows of measurement i that passed, after a keyframe with the nominal array x."""
+    c, chain, stamp = walk.columns, builder.chain, int(walk.columns.stamps[i])
+    first, end = 0 if passed & ROTATION_ONLY else 3, 6 if passed & POSITION_ONLY else 3
+    return Detection(
+        int(c.kinds[i]),
+        int(c.objects[i]),
+        first,
+        end - first,
+        walk.rotations[i],
+        c.translations[i],
+        walk.covariances[i],
+        chain.motion(keyframe_ns, stamp, x),
+        chain.rate(stamp, x),
+        stamp != keyframe_ns,
+    )

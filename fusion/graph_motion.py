@@ -1,0 +1,110 @@
+"""What ties one keyframe to the next: the IMU (CombinedImuFactor) or odometry (a factor between two poses)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import gtsam
+import numpy as np
+from numpy.typing import NDArray
+
+from fusion.graph_model import MOTION_SIZE, SHIFT, TURN, imu_between, motion_between, move, rate_at
+from fusion.graph_variables import GRAVITY_KEY, imu_bias, imu_bias_key, pose_key, velocity_key
+from fusion.nav_state import ACCEL_BIAS, GRAVITY, GYRO_BIAS
+from fusion.options import FuseOptions
+from fusion.prepare import Problem
+from poet_loc.core.records import ImuNoise
+
+Array = NDArray[np.float64]
+Ints = NDArray[np.int64]
+
+_SMALLEST_DENSITY = 1e-8  # a noise density of zero has no information matrix
+_INTEGRATION = 1e-5  # m/sqrt(s): what the midpoint rule leaves
+_STILL = np.zeros(6)
+
+
+@dataclass(frozen=True)
+class MotionChain:
+    """The samples of a log's motion between stamps."""
+
+    stamps_ns: Ints
+    values: Array
+    """(N, 6) angular velocity and specific force, or odometry's twists."""
+    noise: ImuNoise
+    options: FuseOptions
+    with_imu: bool
+    """False: odometry, which knows no velocity and no biases."""
+    estimates_gravity: bool
+
+    @classmethod
+    def of(cls, problem: Problem, options: FuseOptions) -> MotionChain:
+        """Return the chain of a problem."""
+        values = np.hstack([problem.imu.angular_velocity, problem.imu.specific_force])
+        with_imu = problem.motion != "odometry"
+        return cls(problem.imu.stamps_ns, values, problem.imu_noise, options, with_imu, problem.layout.gravity)
+
+    def motion(self, start: int, end: int, x: Array) -> Array:
+        """Return the motion (MOTION_SIZE,) between two stamps at the biases in a nominal array."""
+        biases = x[GYRO_BIAS : ACCEL_BIAS + 3] if self.with_imu else _STILL
+        if start == end:
+            return _NO_MOTION
+        return np.asarray(motion_between(self.stamps_ns, self.values, start, end, biases, not self.with_imu))
+
+    def rate(self, stamp: int, x: Array) -> Array:
+        """Return the angular velocity (3,) at a stamp."""
+        bias = x[GYRO_BIAS : GYRO_BIAS + 3] if self.with_imu else _STILL[:3]
+        return np.asarray(rate_at(self.stamps_ns, self.values, stamp, bias))
+
+    def link(self, k: int, start: int, end: int, x: Array) -> tuple[gtsam.NonlinearFactor, Array]:
+        """Return the factor from keyframe k to the next and the nominal array that it predicts there from x."""
+        predicted = x.copy()
+        if not self.with_imu:
+            motion = self.motion(start, end, x)
+            move(predicted, motion)
+            return self._odometry_factor(k, motion, (end - start) * 1e-9), predicted
+        summed = self.preintegrate(start, end, imu_bias(x), x[GRAVITY : GRAVITY + 3])
+        move(predicted, self.motion(start, end, x))
+        keys = pose_key(k), velocity_key(k), pose_key(k + 1), velocity_key(k + 1), imu_bias_key(k), imu_bias_key(k + 1)
+        if self.estimates_gravity:
+            return gtsam.CombinedImuFactorWithGravityVector(*keys, GRAVITY_KEY, summed), predicted
+        return gtsam.CombinedImuFactor(*keys, summed), predicted
+
+    def _odometry_factor(self, k: int, motion: Array, seconds: float) -> gtsam.NonlinearFactor:
+        walk = self.options.odometry
+        sigma = np.repeat([np.radians(walk.rotation_walk_deg), walk.translation_walk], 3) * np.sqrt(seconds)
+        measured = gtsam.Pose3(gtsam.Rot3(motion[TURN : TURN + 9].reshape(3, 3)), motion[SHIFT : SHIFT + 3])
+        noise = gtsam.noiseModel.Diagonal.Sigmas(sigma)
+        return gtsam.BetweenFactorPose3(pose_key(k), pose_key(k + 1), measured, noise)
+
+    def preintegrate(
+        self, start: int, end: int, bias: gtsam.imuBias.ConstantBias, gravity: Array
+    ) -> gtsam.PreintegratedCombinedMeasurements:
+        """Return the IMU between two stamps, integrated at a bias.
+
+        A gap inside raises the densities of the whole stretch so far that it explains what the gap may have held.
+        """
+        steps = np.empty((int(np.searchsorted(self.stamps_ns, [start, end]) @ [-1, 1]) + 2, 7))
+        biases = np.concatenate([bias.gyroscope(), bias.accelerometer()])
+        longest = self.options.gap.longest_s
+        count, gaps = imu_between(self.stamps_ns, self.values, start, end, biases, longest, steps)
+        summed = gtsam.PreintegratedCombinedMeasurements(self._parameters(gaps / ((end - start) * 1e-9), gravity), bias)
+        for step in steps[:count]:
+            summed.integrateMeasurement(step[4:7], step[1:4], step[0])
+        return summed
+
+    def _parameters(self, gap_s: float, gravity: Array) -> gtsam.PreintegrationCombinedParams:
+        """Every covariance is set: gtsam takes the identity for those that are not."""
+        params, gap = gtsam.PreintegrationCombinedParams(gravity), self.options.gap
+        gyro = self.noise.gyroscope_noise_density**2 + gap_s * gap.angular_rate**2
+        accel = self.noise.accelerometer_noise_density**2 + gap_s * gap.acceleration**2
+        floor, identity = _SMALLEST_DENSITY**2, np.eye(3)
+        params.setGyroscopeCovariance((gyro + floor) * identity)
+        params.setAccelerometerCovariance((accel + floor) * identity)
+        params.setBiasOmegaCovariance((self.noise.gyroscope_random_walk**2 + floor) * identity)
+        params.setBiasAccCovariance((self.noise.accelerometer_random_walk**2 + floor) * identity)
+        params.setIntegrationCovariance(_INTEGRATION**2 * identity)
+        return params
+
+
+_NO_MOTION = np.zeros(MOTION_SIZE)
+_NO_MOTION[[TURN, TURN + 4, TURN + 8]] = 1.0

@@ -1,0 +1,214 @@
+"""The fixed-lag graph against the filter, dense algebra and its own promises."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import gtsam
+import numpy as np
+import pytest
+from filter_runs import simulated
+
+from fusion.fuse import fuse, run_filter
+from fusion.graph import run_graph
+from fusion.graph_smoother import FixedLagSmoother, joint_covariance
+from fusion.options import DetectionBias, Estimate, FuseOptions, Graph
+from fusion.simulate import SimulationOptions, simulate_with_truth
+from poet_loc.core.consistency import pose_nees
+from poet_loc.core.input_error import InputError
+
+GRAPH = FuseOptions(estimator="graph")
+EVERY_STAMP = Graph(keyframe_rate_hz=1000.0, lag_s=0.001, kernel="none")
+
+
+def distances(one, other):
+    """Return how far two results lie apart, row by row: m, rad."""
+    np.testing.assert_array_equal(one.stamps_ns, other.stamps_ns)
+    a, b = one.T_world_imu, other.T_world_imu
+    return np.linalg.norm(a.translation - b.translation, axis=1), (a.rotation.inv() * b.rotation).magnitude()
+
+
+def with_measurements(problem, kept):
+    """Return the problem with some of its measurements only."""
+    measured = problem.measurements
+    return replace(
+        problem, measurements=type(measured)(**{name: getattr(measured, name)[kept] for name in vars(measured)})
+    )
+
+
+def rms_errors(result, truth):
+    reference, valid = truth.interpolate(result.stamps_ns)
+    assert valid.all()
+    est = result.T_world_imu
+    position = np.linalg.norm(est.translation - reference.translation, axis=1)
+    attitude = (est.rotation.inv() * reference.rotation).magnitude()
+    nees = pose_nees(est, reference, result.pose_covariances)
+    return np.sqrt(np.mean(position**2)), np.sqrt(np.mean(attitude**2)), np.mean(nees)
+
+
+@pytest.mark.parametrize("bias", [False, True])
+@pytest.mark.parametrize("measurements", ["camera", "objects"])
+def test_a_lag_of_one_keyframe_is_the_filter(measurements, bias):
+    """With a keyframe at every stamp and nothing kept behind it the graph is a filter that linearises like ours."""
+    options = FuseOptions(measurements=measurements, bias=DetectionBias(use=bias))
+    problem = simulated(measurements, options=options, symmetric_objects=0)
+    causal = run_filter(problem, options)
+    graph = run_graph(problem, replace(options, estimator="graph", graph=EVERY_STAMP))
+    assert graph.name == f"fuse/graph/{measurements}"
+    later = causal.stamps_ns > causal.stamps_ns[0] + 1_000_000_000
+    position, attitude = distances(graph, causal)
+    assert np.all(position[later] < 0.25 * np.linalg.norm(causal.sigmas[later, 3:6], axis=1))
+    assert np.all(attitude[later] < 0.25 * np.linalg.norm(causal.sigmas[later, :3], axis=1))
+    np.testing.assert_allclose(graph.sigmas[later, :6], causal.sigmas[later, :6], rtol=0.1)
+    assert np.mean(graph.gate.position_accepted == causal.gate.position_accepted) > 0.98
+
+
+def test_the_window_stays_bounded_however_long_the_log(monkeypatch):
+    sizes = []
+    extend = FixedLagSmoother.extend
+
+    def watched(self, keyframe, walk):
+        extend(self, keyframe, walk)
+        factors = self._isam.getFactorsUnsafe()
+        alive = sum(factors.at(i) is not None for i in range(factors.size()))
+        sizes.append((len(self._came), alive, factors.size(), self._isam.calculateEstimate().size()))
+
+    monkeypatch.setattr(FixedLagSmoother, "extend", watched)
+    options = replace(GRAPH, graph=Graph(lag_s=0.5, idle_s=0.3))
+    run_graph(simulated(duration_s=24.0, options=options), options)
+    sizes = np.array(sizes)
+    filled, rest = sizes[20 : len(sizes) // 3], sizes[len(sizes) // 3 :]
+    assert len(rest) > 100
+    assert np.all(rest.max(axis=0) <= 1.2 * filled.max(axis=0))
+    np.testing.assert_array_equal(sizes[:, 0], sizes[:, 3])
+
+
+def test_the_marginal_covariance_is_the_inverse_of_the_information(monkeypatch):
+    checked = []
+    extend = FixedLagSmoother.extend
+
+    def watched(self, keyframe, walk):
+        extend(self, keyframe, walk)
+        if len(checked) > 8:
+            return
+        keys = [variable.key for variable in self.builder.newest]
+        linear = self._isam.getFactorsUnsafe().linearize(self._isam.getLinearizationPoint())
+        ordering = gtsam.Ordering()
+        for key in [*keys, *(key for key in self._came if key not in keys)]:
+            ordering.push_back(key)
+        A, _ = linear.jacobian(ordering)
+        size = sum(variable.size for variable in self.builder.newest)
+        scale = 1.0 / np.linalg.norm(A, axis=0)
+        dense = np.linalg.inv((A * scale).T @ (A * scale)) * np.outer(scale, scale)
+        dense, own = dense[:size, :size], joint_covariance(self._isam, keys)
+        sigma = np.sqrt(np.diag(dense))
+        np.testing.assert_allclose(own / np.outer(sigma, sigma), dense / np.outer(sigma, sigma), atol=1e-5)
+        checked.append(size)
+
+    monkeypatch.setattr(FixedLagSmoother, "extend", watched)
+    options = replace(GRAPH, graph=Graph(lag_s=0.5, kernel="none"))
+    run_graph(simulated(duration_s=4.0, options=options), options)
+    assert max(checked) > 15
+
+
+def test_rows_come_at_the_imus_rate_and_know_what_was_measured_by_then():
+    """What comes after a stamp changes nothing before it: the fixed-lag graph is causal."""
+    problem = simulated()
+    whole = run_graph(problem, GRAPH)
+    imu, rows = problem.imu.stamps_ns, whole.stamps_ns
+    every = np.unique(np.r_[imu, problem.measurements.stamps_ns])
+    np.testing.assert_array_equal(rows, every[(every >= rows[0]) & (every <= imu[-1])])
+    cut = int(rows[-200])
+    part = run_graph(with_measurements(problem, problem.measurements.stamps_ns <= cut), GRAPH)
+    same = rows <= cut
+    np.testing.assert_allclose(
+        part.T_world_imu.translation[: same.sum()], whole.T_world_imu.translation[same], atol=1e-9
+    )
+    np.testing.assert_allclose(part.sigmas[: same.sum()], whole.sigmas[same], rtol=1e-6)
+
+
+def test_the_keyframe_rate_is_what_was_asked_for(monkeypatch):
+    stamps = []
+    extend = FixedLagSmoother.extend
+
+    def watched(self, keyframe, walk):
+        stamps.append(keyframe.stamp_ns)
+        extend(self, keyframe, walk)
+
+    monkeypatch.setattr(FixedLagSmoother, "extend", watched)
+    for rate in (3.0, 5.0, 15.0):
+        stamps.clear()
+        options = replace(GRAPH, graph=Graph(keyframe_rate_hz=rate), bias=DetectionBias(use=False))
+        run_graph(simulated(options=options), options)
+        assert 1e9 / np.median(np.diff(stamps)) == pytest.approx(rate, rel=0.01)
+
+
+def test_after_seconds_without_measurements_the_graph_takes_up_again():
+    problem = simulated(duration_s=9.0)
+    measured = problem.measurements
+    t = measured.stamps_ns - measured.stamps_ns[0]
+    kept = (t < 4e9) | (t > 6.5e9)
+    gappy = with_measurements(problem, kept)
+    causal, graph = run_filter(gappy, FuseOptions()), run_graph(gappy, GRAPH)
+    assert graph.restarts == causal.restarts == 0
+    position, _ = distances(graph, causal)
+    assert np.all(position < 3.0 * np.linalg.norm(causal.sigmas[:, 3:6], axis=1))
+
+
+SWITCHES = {
+    "extrinsics": Estimate(extrinsics=True),
+    "time offset": Estimate(time_offset=True),
+    "gravity": Estimate(gravity=True),
+    "approximate map": Estimate(map="approximate"),
+    "unknown map": Estimate(map="unknown"),
+    "everything": Estimate(extrinsics=True, time_offset=True, gravity=True, map="unknown"),
+}
+
+
+@pytest.mark.parametrize("estimator", ["graph", "batch"])
+@pytest.mark.parametrize("name", SWITCHES)
+def test_every_switch_of_the_filter_is_the_graphs_too(name, estimator):
+    options = FuseOptions(estimate=SWITCHES[name])
+    problem = simulated(options=options, symmetric_objects=0, duration_s=8.0)
+    causal = run_filter(problem, options)
+    graph = run_graph(problem, replace(options, estimator=estimator))
+    later = causal.stamps_ns > causal.stamps_ns[0] + 1_000_000_000
+    position, attitude = distances(graph, causal)
+    assert np.all(position[later] < 3.0 * np.linalg.norm(causal.sigmas[later, 3:6], axis=1))
+    assert np.all(attitude[later] < 3.0 * np.linalg.norm(causal.sigmas[later, :3], axis=1))
+    ratio = graph.sigmas[later, :6] / causal.sigmas[later, :6]
+    assert np.median(ratio) < 1.1 if estimator == "graph" else np.median(ratio) < 0.95
+
+
+@pytest.mark.parametrize("estimator", ["graph", "batch"])
+@pytest.mark.parametrize("motion", ["odometry", "constant-velocity"])
+def test_odometry_and_constant_velocity_carry_the_graph_as_they_carry_the_filter(motion, estimator):
+    options = FuseOptions(motion=motion)
+    problem = simulated(options=options, odometry=True)
+    causal, graph = run_filter(problem, options), run_graph(problem, replace(options, estimator=estimator))
+    assert graph.motion == motion
+    later = causal.stamps_ns > causal.stamps_ns[0] + 1_000_000_000
+    position, attitude = distances(graph, causal)
+    assert np.all(position[later] < 3.0 * np.linalg.norm(causal.sigmas[later, 3:6], axis=1))
+    assert np.all(attitude[later] < 3.0 * np.linalg.norm(causal.sigmas[later, :3], axis=1))
+
+
+def test_the_graph_is_as_accurate_and_as_honest_as_the_filter():
+    errors = {"eskf": [], "graph": []}
+    for seed in range(3):
+        rates = {"imu_rate_hz": 100.0, "camera_rate_hz": 15.0}
+        log, _ = simulate_with_truth(SimulationOptions(duration_s=12.0, seed=seed, objects=3, **rates))
+        for estimator, rows in errors.items():
+            options = FuseOptions(estimator=estimator)
+            rows.append(rms_errors(fuse(log, options), log.T_world_imu))
+    causal, graph = (np.mean(np.square(rows), axis=0) ** 0.5 for rows in errors.values())
+    assert np.all(graph[:2] < 1.1 * causal[:2])
+    assert graph[2] < 1.2 * causal[2]
+
+
+def test_a_log_on_which_the_filter_never_starts_says_so():
+    problem = simulated("camera")
+    late = replace(problem.measurements, stamps_ns=problem.measurements.stamps_ns + 10**12)
+    for estimator in ("graph", "batch"):
+        with pytest.raises(InputError, match="never started"):
+            run_graph(replace(problem, measurements=late), FuseOptions(measurements="camera", estimator=estimator))
