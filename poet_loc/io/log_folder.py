@@ -158,8 +158,12 @@ def _refuse_unknown_objects(log: Log) -> None:
         unknown = poses.object_ids[~np.isin(poses.object_ids, known)]
         if unknown.size:
             file = log.path / object_poses_file(name)
+            ids, rows = np.unique(unknown, return_counts=True)
             what = f"object {unknown[0]} is not in the map (it has {', '.join(map(str, sorted(set(known.tolist()))))})"
-            fix = f"add it to {log.path / 'landmarks.json'} or leave its rows out"
+            if len(ids) > 1:
+                counted = ", ".join(f"{each} ({count} rows)" for each, count in zip(ids, rows, strict=True))
+                what += f"; not in it: {counted}"
+            fix = f"add it to {log.path / 'landmarks.json'}, or leave its rows out: poet-loc check LOG --fix COPY does"
             line = line_of_object(file, int(unknown[0])) if file.exists() else None
             raise InputError(what, path=file, line=line, fix=fix)
 

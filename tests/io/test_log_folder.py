@@ -128,6 +128,10 @@ def test_an_object_that_is_not_in_the_map(folder, refusal):
     assert error.line == 4
     assert "object 7 is not in the map (it has 2, 9)" in str(error)
     assert "landmarks.json" in error.fix
+    write_log(folder, Log(folder, {"near": object_poses([2, 9, 7, 11, 7])}))
+    assert "object 7 is not in the map (it has 2, 9); not in it: 7 (2 rows), 11 (1 rows)" in str(
+        refusal(read_log, folder)
+    )
 
 
 @pytest.mark.parametrize("name", ["imu", "camera_poses", "T_world_cam", "T_world_imu", "T_odom_cam", "frames"])
