@@ -29,7 +29,7 @@ MAY_IMPORT = {
 LIVES_IN = {
     "torch": NETWORK,
     "gtsam": ("fusion.graph",),
-    "rerun": ("poet_loc.report.rerun_log",),
+    "rerun": ("poet_loc.report.rerun_log", "poet_loc.report.rerun_comparison"),
     "matplotlib": ("poet_loc.report",),
     "rich": ("poet_loc.report", "poet_loc.cli", *NETWORK),
     "tyro": ("poet_loc.cli",),

@@ -35,7 +35,7 @@ MAX_RATE_HZ = 50.0
 
 _TRUTH: Colour = (230, 230, 230)
 _ORACLE: Colour = (150, 150, 150)
-_PALETTE: tuple[Colour, ...] = (
+PALETTE: tuple[Colour, ...] = (
     (86, 180, 233),
     (213, 94, 0),
     (0, 158, 115),
@@ -60,7 +60,7 @@ def write_recording(record: RunRecord, path: str | Path, name: str = "poet-loc")
         recording.send_recording_name(name)
         recording.log("world", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
         if record.landmark_map is not None and len(record.landmark_map):
-            _log_landmarks(recording, "world/landmarks", record, record.landmark_map, _PALETTE[4])
+            _log_landmarks(recording, "world/landmarks", record, record.landmark_map, PALETTE[4])
         for body, trajectory in record.references.items():
             _log_trajectory(recording, record, f"world/ground_truth/{body}", trajectory, body, _TRUTH)
         colours = _colours(record.estimates)
@@ -129,7 +129,9 @@ def _log_trajectory(
     T = trajectory.T_world_body
     columns = rr.Transform3D.columns(translation=T.translation, quaternion=T.rotation.as_quat())
     recording.send_columns(pose, [time_column(trajectory.stamps_ns)], columns)
-    recording.log(pose, rr.TransformAxes3D(0.05), static=True)
+    # from the first pose on: what is static would stand at the world's origin before it
+    first = [time_column(trajectory.stamps_ns[:1])]
+    recording.send_columns(pose, first, rr.TransformAxes3D.columns(axis_length=[0.05]))
     if record.camera is not None and (body == "cam" or record.T_cam_imu is not None):
         if body == "imu" and record.T_cam_imu is not None:
             T_imu_cam = record.T_cam_imu.inv()
@@ -137,7 +139,7 @@ def _log_trajectory(
             mount = rr.Transform3D(translation=T_imu_cam.translation, quaternion=q_xyzw)
             recording.log(f"{pose}/cam", mount, static=True)
             pose = f"{pose}/cam"
-        recording.log(f"{pose}/view", _pinhole(record.camera, colour), static=True)
+        recording.send_columns(f"{pose}/view", first, _pinhole(record.camera, colour))
 
 
 def _log_ellipsoids(recording: rr.RecordingStream, entity: str, estimate: Estimate, colour: Colour) -> None:
@@ -203,7 +205,7 @@ def _log_states(recording: rr.RecordingStream, fused: Fused) -> None:
     if fused.gate is not None:
         step = _step(fused.gate.stamps_ns)
         time = time_column(fused.gate.stamps_ns[::step])
-        parts = (("position", fused.gate.nis_position, _PALETTE[0]), ("rotation", fused.gate.nis_rotation, _PALETTE[4]))
+        parts = (("position", fused.gate.nis_position, PALETTE[0]), ("rotation", fused.gate.nis_rotation, PALETTE[4]))
         for part, nis, colour in parts:
             entity = f"consistency/{fused.name}/nis_{part}_per_dof"
             style = rr.SeriesPoints(names=f"{fused.name} NIS of {part}/dof [-]", colors=colour, marker_sizes=1.5)
@@ -232,7 +234,7 @@ def _log_detections(recording: rr.RecordingStream, record: RunRecord) -> None:
     detections = detections[np.isin(detections.stamps_ns, frames_ns[:: _step(frames_ns)])]
     stamps_ns, counts = np.unique(detections.stamps_ns, return_counts=True)  # sorted, as detections are
     _, kinds = np.unique(detections.object_ids, return_inverse=True)
-    colours = np.array(_PALETTE)[kinds % len(_PALETTE)]
+    colours = np.array(PALETTE)[kinds % len(PALETTE)]
     entity = "world/ground_truth/cam/pose/detections"
     columns = rr.Points3D.columns(positions=detections.T_cam_obj.translation, colors=colours.astype(np.uint8))
     recording.log(entity, rr.Points3D.from_fields(radii=rr.Radius.ui_points(3.0)), static=True)
@@ -240,7 +242,7 @@ def _log_detections(recording: rr.RecordingStream, record: RunRecord) -> None:
 
 
 def _blueprint(record: RunRecord) -> rrb.Blueprint:
-    names = sorted((estimate.name for estimate in record.estimates), key=_rank)
+    names = sorted((estimate.name for estimate in record.estimates), key=rank)
     hidden = [name for name in names[1:] if name.startswith("localize/") and name != "localize/robust"]
     world = rrb.Spatial3DView(
         origin="world",
@@ -249,12 +251,12 @@ def _blueprint(record: RunRecord) -> rrb.Blueprint:
         line_grid=rrb.LineGrid3D(spacing=0.1),
         eye_controls=_eye(record),
     )
-    rows = sorted(record.evaluation.rows if record.evaluation else (), key=lambda row: _rank(row.name))
+    rows = sorted(record.evaluation.rows if record.evaluation else (), key=lambda row: rank(row.name))
     tabs: list[Any] = []
     if rows:
         tabs.append(_error_views(rows, ERROR_AXES[:3], "position error"))
         tabs.append(_error_views(rows, ERROR_AXES[3:], "attitude error"))
-    for fused in sorted(record.fused, key=lambda fused: _rank(fused.name)):
+    for fused in sorted(record.fused, key=lambda fused: rank(fused.name)):
         states = ("gyroscope_bias", "accelerometer_bias", "velocity")
         views = [rrb.TimeSeriesView(origin=f"states/{fused.name}/{state}", name=state) for state in states]
         tabs.append(rrb.Vertical(*views, name=f"states of {fused.name}"))
@@ -268,7 +270,7 @@ def _blueprint(record: RunRecord) -> rrb.Blueprint:
     tabs += [rrb.Vertical(*views, name="consistency")] if views else []
     lanes = [
         rrb.StateTimelineView(origin=f"decisions/{name}", name=f"used by {name}")
-        for name in sorted(record.decisions, key=_rank)
+        for name in sorted(record.decisions, key=rank)
     ]
     column = [rrb.Tabs(*part) for part in (tabs, lanes) if part]
     shares = [2, 1][: len(column)]
@@ -279,7 +281,7 @@ def _blueprint(record: RunRecord) -> rrb.Blueprint:
     return rrb.Blueprint(layout, rrb.TimePanel(timeline=TIMELINE, expanded=False), collapse_panels=True)
 
 
-def _rank(name: str) -> tuple[bool, bool, bool]:
+def rank(name: str) -> tuple[bool, bool, bool]:
     """Estimates in the order of interest: fused before localised, tightly coupled and robust ones first."""
     return name.startswith("localize/"), not name.endswith(("/objects", "/robust")), name == "localize/best"
 
@@ -293,7 +295,7 @@ def _eye(record: RunRecord) -> rrb.EyeControls3D | None:
         return None
     low, high = np.concatenate(points).min(axis=0), np.concatenate(points).max(axis=0)
     centre, extent = (low + high) / 2, float(np.linalg.norm(high - low)) + 0.2
-    position = centre + extent * np.array([-0.55, -0.75, 0.6])
+    position = centre + extent * np.array([-0.45, -0.6, 0.5])
     return rrb.EyeControls3D(position=position, look_target=centre, eye_up=(0.0, 0.0, 1.0))
 
 
@@ -335,15 +337,16 @@ def _send_measurements(
     recording.send_columns(entity, [time], columns)
 
 
-def _pinhole(camera: Camera, colour: Colour) -> rr.Pinhole:
+def _pinhole(camera: Camera, colour: Colour) -> rr.ComponentColumnList:
+    """A camera's frustum as columns of one row."""
     fx, fy, cx, cy = camera.intrinsics
     resolution = camera.resolution or (round(2 * cx), round(2 * cy))
-    return rr.Pinhole(
-        image_from_camera=np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]]),
-        resolution=resolution,
-        camera_xyz=rr.ViewCoordinates.RDF,
-        image_plane_distance=0.1,
-        color=colour,
+    return rr.Pinhole.columns(
+        image_from_camera=np.array([[[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]]]),
+        resolution=[resolution],
+        camera_xyz=[rr.ViewCoordinates.RDF],
+        image_plane_distance=[0.1],
+        color=[colour],
     )
 
 
@@ -395,7 +398,7 @@ def _in_unit(values: Any, unit: str) -> Array:
 
 def _colours(estimates: Sequence[Estimate]) -> dict[str, Colour]:
     rivals = [estimate.name for estimate in estimates if not estimate.oracle]
-    colours = {name: _PALETTE[k % len(_PALETTE)] for k, name in enumerate(rivals)}
+    colours = {name: PALETTE[k % len(PALETTE)] for k, name in enumerate(rivals)}
     return colours | {estimate.name: _ORACLE for estimate in estimates if estimate.oracle}
 
 

@@ -331,13 +331,23 @@ def test_the_simulated_demo_writes_a_log_and_a_run(tmp_path, monkeypatch, capsys
     assert yaml.safe_load((tmp_path / "demo" / "run" / "options.yaml").read_text())["asked"]["seed"] == 2
 
 
-def test_view_opens_recordings_and_serves_on_this_machine_only(run, monkeypatch):
+def test_view_opens_recordings_and_serves_on_this_machine_only(run, tmp_path, monkeypatch):
     calls = []
-    monkeypatch.setattr(view_command.subprocess, "call", lambda words: calls.append(words) or 0)
+
+    def call(words: list[str]) -> int:
+        assert Path(words[-1]).is_file()
+        calls.append(words)
+        return 0
+
+    monkeypatch.setattr(view_command.subprocess, "call", call)
+    other = shutil.copytree(run, tmp_path / "other")
     assert main(["view", str(run)]) == 0
-    assert main(["view", str(run), str(run), "--web"]) == 0
-    recording, here = str(run / "recording.rrd"), ["--bind", "127.0.0.1"]
-    assert [words[1:] for words in calls] == [[*here, recording], [*here, "--web-viewer", recording, recording]]
+    assert main(["view", str(run), str(other), "--web"]) == 0
+    here = ["--bind", "127.0.0.1"]
+    assert calls[0][1:] == [*here, str(run / "recording.rrd")]
+    assert calls[1][1:-1] == [*here, "--web-viewer"]
+    assert Path(calls[1][-1]).name == "comparison.rrd"
+    assert not Path(calls[1][-1]).exists()  # it was temporary
 
 
 def test_the_program_itself_in_a_pipe(clean_log, tmp_path):

@@ -44,6 +44,10 @@ def column(chunks: list[Chunk], ending: str) -> Any:
     return found[0]
 
 
+def having(chunks: list[Chunk], archetype: str) -> list[Chunk]:
+    return [chunk for chunk in chunks if any(archetype in name for name in chunk.to_record_batch().schema.names)]
+
+
 def stamps_of(chunks: list[Chunk]) -> np.ndarray:
     return np.array(column(chunks, rerun_log.TIMELINE).cast("int64"))
 
@@ -90,11 +94,17 @@ def test_a_layout_comes_with_it(recording: Path) -> None:
 
 
 def test_time_is_the_sensors_to_the_nanosecond(run_record: RunRecord, chunks: dict[str, list[Chunk]]) -> None:
-    poses = chunks["world/ground_truth/cam/pose"]
+    poses = having(chunks["world/ground_truth/cam/pose"], "Transform3D")
     np.testing.assert_array_equal(stamps_of(poses), run_record.references["cam"].stamps_ns)
     for parts in chunks.values():
         for chunk in parts:
             assert chunk.is_static or chunk.timeline_names == [rerun_log.TIMELINE]
+
+
+def test_cameras_show_from_the_first_pose_on(run_record: RunRecord, chunks: dict[str, list[Chunk]]) -> None:
+    view = "world/estimates/fuse/eskf/objects/pose/cam/view"
+    assert stamps_of(chunks[view]).tolist() == [int(run_record.fused[0].stamps_ns[0])]
+    assert not any(chunk.is_static for chunk in chunks[view])
 
 
 def test_poses_and_errors_are_the_records(run_record: RunRecord, chunks: dict[str, list[Chunk]]) -> None:
@@ -156,7 +166,7 @@ def test_long_logs_are_thinned(run_record: RunRecord, tmp_path: Path, monkeypatc
     rerun_log.write_recording(run_record, tmp_path / "thin.rrd")
     thin = read(tmp_path / "thin.rrd")
     assert max(chunk.num_rows for name, parts in thin.items() for chunk in parts if "decisions" not in name) <= 50
-    assert stamps_of(thin["world/ground_truth/cam/pose"])[0] == run_record.start_ns
+    assert stamps_of(having(thin["world/ground_truth/cam/pose"], "Transform3D"))[0] == run_record.start_ns
 
 
 def test_stamps_from_the_sensors_start_are_durations(run_record: RunRecord, tmp_path: Path) -> None:
@@ -164,8 +174,8 @@ def test_stamps_from_the_sensors_start_are_durations(run_record: RunRecord, tmp_
     shifted = replace(estimate.trajectory, stamps_ns=estimate.trajectory.stamps_ns - run_record.start_ns)
     bare = RunRecord(estimates=(replace(estimate, trajectory=shifted),))
     rerun_log.write_recording(bare, tmp_path / "bare.rrd")
-    stamps = stamps_of(read(tmp_path / "bare.rrd")["world/estimates/localize/best/pose"])
-    np.testing.assert_array_equal(stamps, shifted.stamps_ns)
+    poses = having(read(tmp_path / "bare.rrd")["world/estimates/localize/best/pose"], "Transform3D")
+    np.testing.assert_array_equal(stamps_of(poses), shifted.stamps_ns)
 
 
 def test_a_record_with_nothing_but_a_silent_estimate_is_written(run_record: RunRecord, tmp_path: Path) -> None:
