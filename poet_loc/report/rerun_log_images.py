@@ -38,6 +38,9 @@ class Attention:
     """(K,)"""
 
 
+_NOWHERE = Attention(np.zeros((0, 2)), np.zeros(0))
+
+
 def write_image_recording(
     path: str | Path,
     images: SeenImages,
@@ -77,7 +80,7 @@ def log_images(
     if detections is not None and camera is not None:
         _log_poses(recording, images.stamps_ns, time, detections, camera, label_of)
     if attention:
-        _log_attention(recording, attention)
+        _log_attention(recording, images.stamps_ns, attention)
 
 
 def _log_boxes(recording: rr.RecordingStream, images: SeenImages, time: Sequence[rr.TimeColumn]) -> None:
@@ -113,25 +116,28 @@ def _log_poses(
     recording.send_columns(entity, time, columns.partition(3 * counts))
     names = [label_of(int(detections.object_ids[row]), int(detections.instances[row])) for row in order]
     points = rr.Points2D.columns(positions=lines[order, 0, 0], labels=names)
-    recording.log(f"{ENTITY}/objects", rr.Points2D.from_fields(radii=rr.Radius.ui_points(2.0)), static=True)
+    style = rr.Points2D.from_fields(radii=rr.Radius.ui_points(2.0), show_labels=False)  # a click shows them
+    recording.log(f"{ENTITY}/objects", style, static=True)
     recording.send_columns(f"{ENTITY}/objects", time, points.partition(counts))
     if outlines is not None:
         entity = f"{ENTITY}/position_3_sigma"
         strips = rr.LineStrips2D.columns(strips=list(outlines[order]))
-        style = rr.LineStrips2D.from_fields(colors=[_SIGMA_COLOUR], radii=rr.Radius.ui_points(0.75))
-        recording.log(entity, style, static=True)
+        outline = rr.LineStrips2D.from_fields(colors=[_SIGMA_COLOUR], radii=rr.Radius.ui_points(0.75))
+        recording.log(entity, outline, static=True)
         recording.send_columns(entity, time, strips.partition(counts))
 
 
-def _log_attention(recording: rr.RecordingStream, attention: Mapping[int, Attention]) -> None:
-    stamps = sorted(attention)
-    points = np.concatenate([attention[stamp].points for stamp in stamps])
-    share = np.concatenate([attention[stamp].weights / attention[stamp].weights.max() for stamp in stamps])
+def _log_attention(
+    recording: rr.RecordingStream, stamps_ns: NDArray[np.int64], attention: Mapping[int, Attention]
+) -> None:
+    """Points of an image vanish with the next one."""
+    looked = [attention.get(stamp, _NOWHERE) for stamp in stamps_ns.tolist()]
+    points = np.concatenate([each.points for each in looked])
+    share = np.concatenate([each.weights / each.weights.max(initial=1e-12) for each in looked])
     colours = np.stack([np.full(len(share), 255), 80 + 175 * share, 40 + 0 * share, 40 + 200 * share], axis=1)
     columns = rr.Points2D.columns(positions=points, radii=0.4 + 2.2 * np.sqrt(share), colors=colours.astype(np.uint8))
-    counts = [len(attention[stamp].points) for stamp in stamps]
-    times = [time_column(np.array(stamps, np.int64))]
-    recording.send_columns(f"{ENTITY}/attention", times, columns.partition(counts))
+    counts = [len(each.points) for each in looked]
+    recording.send_columns(f"{ENTITY}/attention", [time_column(stamps_ns)], columns.partition(counts))
 
 
 def _thinned(images: SeenImages) -> SeenImages:

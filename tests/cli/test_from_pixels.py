@@ -65,6 +65,6 @@ def test_a_recording_shows_where_the_network_looked(videos, tmp_path, capsys):
     chunks = {c.entity_path.strip("/"): c for c in RrdReader(str(out / "recording.rrd")).stream() if not c.is_static}
     points = chunks["camera/image/attention"].to_record_batch()
     (positions,) = [points.column(name).to_pylist() for name in points.schema.names if name.endswith("positions")]
-    assert len(positions) > 15
-    everywhere = np.concatenate([np.array(row) for row in positions])
+    assert sum(bool(row) for row in positions) > 15
+    everywhere = np.concatenate([np.array(row) for row in positions if row])
     assert np.mean(np.all((everywhere > -20) & (everywhere < [340, 260]), axis=1)) > 0.95
