@@ -357,17 +357,20 @@ def fades(x: Array, b: int, first: int, kind: int, bias_model: Array) -> bool:
 
 
 @njit(cache=True)
-def forget_bias(x: Array, P: Array, k: int, first: int, bias_model: Array, layout: Ints) -> None:
-    """Let an object's varying bias of rotation (first 0) or translation (3) have jumped.
+def forget_bias(x: Array, P: Array, k: int, first: int, bias_model: Array, layout: Ints, kind: int) -> None:
+    """Forget an object's bias of rotation (first 0) or translation (3); kind 0, the varying one, has jumped.
 
-    Its mean becomes zero again and its sigma a multiple of the stationary one; what it knew of other states is dropped.
+    Its mean becomes zero again and its sigma, if it jumped, a multiple of the stationary one; what it knew of other
+    states is dropped.
     """
-    n, at, b = layout[N_ERROR], layout[AT_BIASES] + 6 * k, layout[BIASES] + 6 * k
+    shift = 6 * (k + kind * layout[N_OBJECTS])
+    n, at, b = layout[N_ERROR], layout[AT_BIASES] + shift, layout[BIASES] + shift
     for i in range(first, first + 3):
         x[b + i] = 0.0
         for j in range(n):
             P[at + i, j] = P[j, at + i] = 0.0
-        P[at + i, at + i] = (bias_model[BIAS_JUMP] * bias_sigma(bias_model, 0, i)) ** 2
+        scale = bias_model[BIAS_JUMP] if kind == 0 else 1.0
+        P[at + i, at + i] = (scale * bias_sigma(bias_model, kind, i)) ** 2
 
 
 @njit(cache=True)

@@ -46,6 +46,7 @@ from fusion.memory import (
     LAST_UPDATE,
     MODE,
     NOW,
+    REFUSED_ROW,
     RESTARTS,
     STARTED_AT,
     TRACKING,
@@ -78,6 +79,7 @@ from fusion.nav_state import (
     Ints,
 )
 from fusion.odometry import IS_ODOMETRY, move_by_odometry, spread_by_odometry
+from fusion.place_watch import ON_MAP, RELEASE, RELEASED, TURNED, forget_places, status_of, tally, watch
 from fusion.so3_kernels import (
     apply,
     multiply,
@@ -226,20 +228,64 @@ def measure(
             j = _next(first, last, decisions, nis)
             k, R_m, t_m = objects[j], rotations[j], translations[j]
             decisions[j] = _update(m, w, kinds[j], k, R_m, t_m, covariances[j], rate, nis[j], True)
-            accepted = accepted or decisions[j] != REJECTED
+            accepted = accepted or decisions[j] & ACCEPTED != 0
         for j in range(first, last if accepted else first):
             if decisions[j] == REJECTED:  # refused before the others had moved the state: ask again
                 k, R_m, t_m = objects[j], rotations[j], translations[j]
                 decisions[j] = _update(m, w, kinds[j], k, R_m, t_m, covariances[j], rate, nis[j], True)
-    for j in range(first, last):
-        _follow_jumps(m, kinds[j], objects[j], decisions[j])
-        _vote(m, w, kinds[j], objects[j], rotations[j], translations[j], decisions[j])
-    if accepted:
-        c[LAST_UPDATE] = c[NOW]
+    account(m, w, first, last, kinds, objects, rotations, translations, covariances, rate, decisions, nis)
     if c[MODE] == INITIALISING:
         _try_to_start(m, w)
     else:
         _restart_if_lost(m, w)
+
+
+@njit(cache=True)
+def account(
+    m: Memory,
+    w: Work,
+    first: int,
+    last: int,
+    kinds: Ints,
+    objects: Ints,
+    rotations: Array,
+    translations: Array,
+    covariances: Array,
+    rate: Array,
+    decisions: Ints,
+    nis: Array,
+) -> None:
+    """Draw the conclusions of what became of the measurements of a stamp: jumps, votes, tallies, moved objects."""
+    c, accepted, refused = m.counters, False, 0
+    for j in range(first, last):
+        _follow_jumps(m, kinds[j], objects[j], decisions[j])
+        _vote(m, w, kinds[j], objects[j], rotations[j], translations[j], decisions[j])
+        accepted = accepted or decisions[j] & ACCEPTED != 0
+        refused += decisions[j] == REJECTED
+        if c[MODE] == TRACKING:
+            tally(m, kinds[j], objects[j], decisions[j], nis[j, 0], m.limits[LIMIT_BOTH])
+    if c[MODE] != TRACKING:
+        return
+    c[REFUSED_ROW] = 0 if accepted else c[REFUSED_ROW] + refused
+    if accepted:
+        c[LAST_UPDATE] = c[NOW]
+    for j in range(first, last if m.moved[RELEASE] > 0.0 else first):
+        k = objects[j]
+        if kinds[j] != OBJECT_POSE or m.known[k] == 0.0:
+            continue
+        if watch(m, w, k, rotations[j], translations[j], covariances[j], rate, m.limits[NOMINAL_OFFSET]) != 0:
+            _forget_biases(m, k)
+
+
+@njit(cache=True)
+def _forget_biases(m: Memory, k: int) -> None:
+    """Forget every bias of an object that leaves its place in the map or returns to it."""
+    for kind in range(m.layout[N_BIAS_KINDS]):
+        for first in (0, 3):
+            forget_bias(m.x, m.P, k, first, m.bias_model, m.layout, kind)
+            if len(m.tape) > 0:
+                note_forgetting(m, k + kind * m.layout[N_OBJECTS], first)
+    m.refused[k, 0] = m.refused[k, 1] = 0.0
 
 
 @njit(cache=True)
@@ -312,17 +358,19 @@ def _update(
         kind, k, R_m, t_m, m.x, rate, m.limits[NOMINAL_OFFSET], m.layout, w.residual, w.H, m.columns, w.step
     )
     innovation(m.P, w.H, m.columns, count, w.R, n, w.PHt, w.S)
-    decision = gate(w.S, w.residual, m.limits, m.limits[PARTIAL], w.L, w.white, nis)
+    decision, status = gate(w.S, w.residual, m.limits, m.limits[PARTIAL], w.L, w.white, nis), status_of(m, kind, k)
     if not correcting:
         return decision
     if kind == OBJECT_POSE and m.limits[ADAPTATION] > 0.0:
         _adapt_scale(m, k, nis[0])
+    if status != ON_MAP:
+        decision = POSITION_ONLY if status == TURNED and nis[2] <= m.limits[LIMIT_POSITION] else REJECTED
     if decision != REJECTED:
         first, size = 3 if decision == POSITION_ONLY else 0, 6 if decision == ACCEPTED else 3
         correct(m.x, m.P, w.PHt, w.S, w.residual, first, size, m.layout, w.L, w.white, w.Z, w.error, w.scratch)
         if len(m.tape) > 0:
             note_correction(m, w, first, size, count)
-    return decision
+    return decision if status == ON_MAP else decision | RELEASED
 
 
 @njit(cache=True)
@@ -341,7 +389,7 @@ def _meet_object(m: Memory, w: Work, k: int, R_m: Array, t_m: Array, rate: Array
         m.x[at + 9 + i] = p_wi[i] + w.step[33 + i] + away[i]
     if m.layout[N_BIAS_KINDS] > 0:
         for first in (0, 3):
-            forget_bias(m.x, m.P, k, first, m.bias_model, m.layout)
+            forget_bias(m.x, m.P, k, first, m.bias_model, m.layout, 0)
             if len(m.tape) > 0:
                 note_forgetting(m, k, first)
     count = residual_and_jacobian(
@@ -359,11 +407,11 @@ def _follow_jumps(m: Memory, kind: int, k: int, decision: int) -> None:
     """Networks err in runs: an object refused often in a row has another bias now, so its old one is forgotten."""
     if kind != OBJECT_POSE or m.counters[MODE] != TRACKING or m.layout[N_BIAS_KINDS] == 0:
         return
-    for part in range(2):
+    for part in range(status_of(m, kind, k), 2):  # what is released cannot jump
         used = decision & (POSITION_ONLY if part == 1 else ROTATION_ONLY)
         m.refused[k, part] = 0.0 if used else m.refused[k, part] + 1.0
         if m.refused[k, part] >= m.limits[JUMP_AFTER]:
-            forget_bias(m.x, m.P, k, 3 * part, m.bias_model, m.layout)
+            forget_bias(m.x, m.P, k, 3 * part, m.bias_model, m.layout, 0)
             if len(m.tape) > 0:
                 note_forgetting(m, k, 3 * part)
             m.refused[k, part] = 0.0
@@ -389,7 +437,7 @@ def _fit_object_symmetry(m: Memory, w: Work, k: int, R_m: Array, rate: Array) ->
 @njit(cache=True)
 def _vote(m: Memory, w: Work, kind: int, k: int, rotation: Array, translation: Array, decision: int) -> None:
     """Remember where a measurement puts the imu. A symmetric object does not say which way it is turned: no vote."""
-    if kind == OBJECT_POSE and (m.orders[k] != 1 or m.known[k] == 0.0):
+    if kind == OBJECT_POSE and (m.orders[k] != 1 or m.known[k] == 0.0 or status_of(m, kind, k) != ON_MAP):
         return
     slot = m.counters[VOTE_HEAD] % len(m.vote_stamps)
     vote = m.votes[slot]
@@ -477,7 +525,7 @@ def _try_to_start(m: Memory, w: Work) -> None:
     if count < enough or span < m.start[START_MIN_SPAN_S]:
         return
     _adopt(m, w, 0)
-    m.counters[MODE], m.counters[STARTED_AT] = TRACKING, m.counters[NOW]
+    m.counters[MODE], m.counters[STARTED_AT], m.counters[LAST_UPDATE] = TRACKING, m.counters[NOW], m.counters[NOW]
 
 
 @njit(cache=True)
@@ -529,6 +577,7 @@ def _adopt(m: Memory, w: Work, keep_from: int) -> None:
         m.x[m.layout[BIASES] + i] = 0.0
         m.P[at + i, at + i] = bias_sigma(m.bias_model, kind, component) ** 2
     m.counters[BIAS_TIME] = m.counters[NOW]
+    forget_places(m)
     # The agreeing votes count as used, so that a restart is not followed by the next at once.
     for a in range(len(m.inliers)):
         if m.inliers[a]:

@@ -14,8 +14,10 @@ from scipy.spatial.transform import Rotation
 from fusion import filter_loop, memory
 from fusion.calibrated import calibrated
 from fusion.eskf import POSITION_ONLY, ROTATION_ONLY
+from fusion.health import run_health
 from fusion.measurements import Measurements
 from fusion.options import FuseOptions
+from fusion.place_watch import RELEASED
 from fusion.prepare import Problem, fill_memory, pose_problem
 from fusion.result import FuseResult, GateLog
 from poet_loc.core.geometry import make_pose
@@ -59,6 +61,11 @@ def fuse(
     """
     options = options or FuseOptions()
     problem = pose_problem(log, options, camera_poses, object_poses)
+    result = _estimate(problem, options)
+    return replace(result, health=run_health(result, options, int(problem.imu.stamps_ns[0])))
+
+
+def _estimate(problem: Problem, options: FuseOptions) -> FuseResult:
     if options.estimator == "eskf":
         if options.smooth:
             from fusion.smoother import run_smoother  # which is built on this module
@@ -171,4 +178,5 @@ def gate_log(problem: Problem, decisions: NDArray[np.int64], nis: Array) -> Gate
         nis[:, 1],
         (decisions & POSITION_ONLY) > 0,
         (decisions & ROTATION_ONLY) > 0,
+        (decisions & RELEASED) > 0,
     )

@@ -19,8 +19,23 @@ Ints = NDArray[np.int64]
 VOTES = 256  # a second of eight objects at 30 Hz
 
 # Counters, part of what a snapshot keeps.
-NOW, IMU_AT, MODE, BIAS_TIME, STARTED_AT, VOTE_HEAD, RESTARTS, LAST_UPDATE, UP_COUNT, TAPE_END, N_COUNTERS = range(11)
+(
+    NOW,
+    IMU_AT,
+    MODE,
+    BIAS_TIME,
+    STARTED_AT,
+    VOTE_HEAD,
+    RESTARTS,
+    LAST_UPDATE,
+    UP_COUNT,
+    TAPE_END,
+    REFUSED_ROW,
+    N_COUNTERS,
+) = range(12)
 INITIALISING, TRACKING = 0, 1
+
+TALLY_SIZE, PLACE_SIZE = 8, 15  # rows of tallies and places, see place_watch.py
 
 # Integer header: where things stand in the float buffer, sizes.
 (
@@ -29,12 +44,15 @@ INITIALISING, TRACKING = 0, 1
     AT_SCALES,
     AT_REFUSED,
     AT_KNOWN,
+    AT_TALLIES,
+    AT_PLACES,
     AT_UP,
     END_OF_STATE,
     AT_NOISE,
     AT_LIMITS,
     AT_START,
     AT_BIAS_MODEL,
+    AT_MOVED,
     AT_AXES,
     AT_PRIOR,
     AT_WORK,
@@ -51,7 +69,7 @@ INITIALISING, TRACKING = 0, 1
     AT_TAPE,
     TAPE_SIZE,
     HEADER,
-) = range(27)
+) = range(30)
 
 
 class Memory(NamedTuple):
@@ -62,11 +80,14 @@ class Memory(NamedTuple):
     scales: Array  # (K,) how much larger than stated each object's noise has shown itself
     refused: Array  # (K, 2) how often in a row each object's rotation and position were refused
     known: Array  # (K,) 1 where an object's pose in the world is known, 0 before it was first seen
+    tallies: Array  # (K + 1, .) how the measurements of each object, and camera poses, fared: places in place_watch.py
+    places: Array  # (K, .) where each object stands against the map: places in place_watch.py
     up: Array  # (3,) running mean of the specific force in the axes of the integrated motion
     noise: Array  # of the motion: places in imu.py and odometry.py
     limits: Array  # places: filter_loop.LIMIT_BOTH and following
     start: Array
     bias_model: Array
+    moved: Array  # when an object counts as moved: places in place_watch.py
     axes: Array  # (K, 3) symmetry axes
     prior: Array  # (n,) 1-sigma of the error state at the start
     work: Array
@@ -91,12 +112,15 @@ def allocate(layout: StateLayout) -> tuple[Array, Ints]:
         (AT_SCALES, max(K, 1)),
         (AT_REFUSED, 2 * max(K, 1)),
         (AT_KNOWN, max(K, 1)),
+        (AT_TALLIES, TALLY_SIZE * (max(K, 1) + 1)),
+        (AT_PLACES, PLACE_SIZE * max(K, 1)),
         (AT_UP, 3),
         (END_OF_STATE, 0),
         (AT_NOISE, 12),
         (AT_LIMITS, 12),
         (AT_START, 16),
         (AT_BIAS_MODEL, 14),
+        (AT_MOVED, 12),
         (AT_AXES, 3 * max(K, 1)),
         (AT_PRIOR, n),
         (AT_WORK, work_size(n)),
@@ -163,11 +187,14 @@ def views(floats: Array, integers: Ints) -> Memory:
         f[i[AT_SCALES] : i[AT_SCALES] + K],
         f[i[AT_REFUSED] : i[AT_REFUSED] + 2 * K].reshape((K, 2)),
         f[i[AT_KNOWN] : i[AT_KNOWN] + K],
+        f[i[AT_TALLIES] : i[AT_TALLIES] + TALLY_SIZE * (K + 1)].reshape((K + 1, TALLY_SIZE)),
+        f[i[AT_PLACES] : i[AT_PLACES] + PLACE_SIZE * K].reshape((K, PLACE_SIZE)),
         f[i[AT_UP] : i[AT_UP] + 3],
         f[i[AT_NOISE] : i[AT_NOISE] + 12],
         f[i[AT_LIMITS] : i[AT_LIMITS] + 12],
         f[i[AT_START] : i[AT_START] + 16],
         f[i[AT_BIAS_MODEL] : i[AT_BIAS_MODEL] + 14],
+        f[i[AT_MOVED] : i[AT_MOVED] + 12],
         f[i[AT_AXES] : i[AT_AXES] + 3 * K].reshape((K, 3)),
         f[i[AT_PRIOR] : i[AT_PRIOR] + n],
         f[i[AT_WORK] : i[AT_WORK] + work_size(n)],

@@ -42,7 +42,7 @@ def motion_source(
     if kind == "auto":
         kind = "imu" if log.imu is not None else "odometry" if log.T_odom_cam is not None else "constant-velocity"
     if kind == "imu":
-        return _imu(log, calibration)
+        return _imu(log, calibration, options)
     body: Literal["imu", "cam"] = "cam" if calibration.T_cam_imu is None else "imu"
     if kind == "odometry":
         if log.T_odom_cam is None or len(log.T_odom_cam) < 2:
@@ -53,14 +53,26 @@ def motion_source(
     return MotionSource("constant-velocity", _nothing_measured(stamps_ns, options), _smooth(options), body)
 
 
-def _imu(log: Log, calibration: Calibration) -> MotionSource:
+def _imu(log: Log, calibration: Calibration, options: FuseOptions) -> MotionSource:
     if log.imu is None:
         raise InputError("the log has no imu.csv", path=log.path, fix="choose another --motion")
     if calibration.imu is None or calibration.T_cam_imu is None:
         raise InputError(
             "fusion needs T_cam_imu and the IMU's noise densities", path=log.path / "calibration.yaml", fix="add them"
         )
-    return MotionSource("imu", log.imu, calibration.imu, "imu")
+    return MotionSource("imu", log.imu, scaled_noise(calibration.imu, options), "imu")
+
+
+def scaled_noise(noise: ImuNoise, options: FuseOptions) -> ImuNoise:
+    """Return the calibration's noise of the IMU as far as the options believe it."""
+    density, walk = options.imu.noise_scale, options.imu.walk_scale
+    return ImuNoise(
+        density * noise.gyroscope_noise_density,
+        density * noise.accelerometer_noise_density,
+        walk * noise.gyroscope_random_walk,
+        walk * noise.accelerometer_random_walk,
+        noise.update_rate,
+    )
 
 
 def _nothing_measured(stamps_ns: NDArray[np.int64], options: FuseOptions) -> ImuSamples:

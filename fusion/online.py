@@ -16,25 +16,35 @@ import math
 import operator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal, SupportsIndex
+from typing import SupportsIndex
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from fusion import memory, replay, replay_memory
-from fusion.eskf import POSITION_ONLY, ROTATION_ONLY
-from fusion.filter_loop import LIMIT_BOTH
+from fusion.health import Mode, ObjectHealth, mode_of
 from fusion.measurements import CAMERA_POSE, OBJECT_POSE, Measurements, ray_aligned_covariance
+from fusion.motion_source import scaled_noise
 from fusion.nav_state import ACCEL_BIAS, CORE, GYRO_BIAS, POSITION, VELOCITY, StateLayout
 from fusion.options import FuseOptions
+from fusion.place_watch import (
+    IN_A_ROW,
+    LONGEST,
+    ON_MAP,
+    POSES,
+    POSITION_USED,
+    RATIO,
+    ROTATION_USED,
+    STATUS,
+    TESTED,
+)
 from fusion.prepare import NEAREST_OBJECT, Problem, fill_memory, layout_for, time_shift_ns
 from poet_loc.core.geometry import make_pose
 from poet_loc.core.input_error import InputError
 from poet_loc.core.records import Calibration, ImuSamples, LandmarkMap
 
 Array = NDArray[np.float64]
-Mode = Literal["initialising", "tracking", "coasting"]
 
 
 @dataclass(frozen=True)
@@ -51,8 +61,6 @@ class OnlineOptions:
     """The buffers hold the horizon at this rate of the IMU, Hz; above it the horizon shrinks."""
     max_pose_rate_hz: float = 1000.0
     """The buffers hold so many poses per second, over all objects, Hz; what does not fit is refused and counted."""
-    coasting_after_s: float = 0.5
-    """Without an accepted pose for so long the mode is coasting, s."""
 
 
 @dataclass(frozen=True)
@@ -72,6 +80,8 @@ class OnlineState:
     """(3,) m/s^2."""
     covariance: Array
     """(15, 15) of [attitude (imu axes), position, velocity (world axes), gyroscope bias, accelerometer bias]."""
+    mode: Mode
+    """tracking, coasting or lost; how each object fares is said by `Estimator.health`."""
 
     @property
     def T_world_imu(self) -> RigidTransform:
@@ -82,19 +92,6 @@ class OnlineState:
     def sigmas(self) -> Array:
         """(15,) 1-sigma of the error state."""
         return np.sqrt(np.diag(self.covariance).clip(min=0.0))
-
-
-@dataclass(frozen=True)
-class ObjectHealth:
-    """How one object's poses within the horizon fared."""
-
-    poses: int
-    position_accepted: float
-    """Share, NaN without poses."""
-    rotation_accepted: float
-    """Share, NaN without poses."""
-    test_ratio: float
-    """Median NIS over its limit: above 1 most are refused; NaN without poses that met a started filter."""
 
 
 @dataclass(frozen=True)
@@ -235,17 +232,14 @@ class Estimator:
             x[GYRO_BIAS : GYRO_BIAS + 3],
             x[ACCEL_BIAS : ACCEL_BIAS + 3],
             m.P[:CORE, :CORE].copy(),
+            self._mode(),
         )
 
     def health(self) -> Health:
-        """Return the counts of everything that was fed, and how the poses within the horizon fared."""
+        """Return the counts of everything that was fed, and how each object's poses have fared since the start."""
         h, counters = self._ring.header, self.memory.counters
-        mode: Mode = "initialising"
-        if counters[memory.MODE] == memory.TRACKING:
-            silent_s = (counters[memory.NOW] - max(counters[memory.LAST_UPDATE], counters[memory.STARTED_AT])) * 1e-9
-            mode = "coasting" if silent_s > self.online.coasting_after_s else "tracking"
         return Health(
-            mode,
+            self._mode(),
             int(counters[memory.RESTARTS]),
             int(h[replay_memory.COUNT] - h[replay_memory.NEXT]),
             int(h[replay_memory.DUPLICATES]),
@@ -258,24 +252,20 @@ class Estimator:
             self._object_health(),
         )
 
+    def _mode(self) -> Mode:
+        m, c = self.memory, self.memory.counters
+        if c[memory.MODE] != memory.TRACKING:
+            return "initialising"
+        sigma = math.sqrt(max(m.P[3, 3], m.P[4, 4], m.P[5, 5]))
+        silent_s = (c[memory.NOW] - c[memory.LAST_UPDATE]) * 1e-9
+        return mode_of(silent_s, sigma, int(c[memory.REFUSED_ROW]), self.options.health)
+
     def _object_health(self) -> dict[tuple[int, int], ObjectHealth]:
-        r, h = self._ring, self._ring.header
-        done = slice(0, int(h[replay_memory.NEXT]))
-        recent = r.stamps[done] >= self.memory.counters[memory.NOW] - h[replay_memory.HORIZON]
-        objects, decisions, nis = (column[done][recent] for column in (r.objects, r.decisions, r.nis))
-        limit, found = self.memory.limits[LIMIT_BOTH], {}
-        for k, key in enumerate([*self.keys, (-1, 0)]):
-            own = objects == (k if k < len(self.keys) else -1)
-            count = int(np.count_nonzero(own))
-            if key == (-1, 0) and count == 0:
-                continue
-            tested = nis[own, 0][nis[own, 0] > 0.0]
-            found[key] = ObjectHealth(
-                count,
-                float(np.mean((decisions[own] & POSITION_ONLY) > 0)) if count else math.nan,
-                float(np.mean((decisions[own] & ROTATION_ONLY) > 0)) if count else math.nan,
-                float(np.median(tested)) / limit if len(tested) else math.nan,
-            )
+        rows, places = self.memory.tallies, self.memory.places
+        keys = enumerate(self.keys[: self.layout.n_objects])
+        found = {key: _object_health(rows[k], bool(places[k, STATUS] != ON_MAP)) for k, key in keys}
+        if rows[-1, POSES]:
+            found[-1, 0] = _object_health(rows[-1], False)
         return found
 
     def _detection_covariances(self, t: Array, covariances: ArrayLike | None) -> Array:
@@ -305,6 +295,19 @@ class Estimator:
         replay.feed(self._floats, self._integers, self._ring_floats, self._ring_integers, what, stamp, count)
 
 
+def _object_health(row: Array, released: bool) -> ObjectHealth:
+    poses, tested = row[POSES], row[TESTED]
+    return ObjectHealth(
+        int(poses),
+        row[POSITION_USED] / poses if poses else math.nan,
+        row[ROTATION_USED] / poses if poses else math.nan,
+        float(row[RATIO]) if tested else math.nan,
+        int(row[IN_A_ROW]),
+        int(row[LONGEST]),
+        released,
+    )
+
+
 def _empty_problem(
     calibration: Calibration, landmark_map: LandmarkMap | None, options: FuseOptions, layout: StateLayout | None
 ) -> Problem:
@@ -318,7 +321,7 @@ def _empty_problem(
     return Problem(
         Path("online"),
         ImuSamples(none, nothing.reshape(0, 3), nothing.reshape(0, 3)),
-        calibration.imu,
+        scaled_noise(calibration.imu, options),
         calibration,
         Measurements(none, none, none, nothing.reshape(0, 9), nothing.reshape(0, 3), nothing.reshape(0, 6, 6)),
         layout or layout_for(landmark_map, options),

@@ -82,6 +82,52 @@ class Gate:
 
 
 @dataclass(frozen=True)
+class Moved:
+    """An object that stands elsewhere than the map says, while all others agree, is released from the map (eskf).
+
+    It is told from a network's gross errors by standing still in the world while the camera moves, and from its biases
+    by their size. A released object corrects nothing, and one that was turned where it stands only by its position,
+    until it is found at its place in the map again.
+    """
+
+    release: bool = True
+    """Release objects that were moved."""
+    then: Literal["leave-out", "re-estimate"] = "leave-out"
+    """re-estimate: where a released object stands still, its pose is estimated anew as that of an unknown object, and
+    the objects' poses are states from the start on."""
+    distance: float = 0.05
+    """An object has been moved where the mean of its detections is further off the map than this, m,"""
+    angle_deg: float = 15.0
+    """or turned by more than this, deg,"""
+    sigmas: float = 5.0
+    """and by more 1-sigma of noise and biases than this,"""
+    scatter: float = 0.5
+    """and the detections scatter about that mean by less than this share of it,"""
+    after_s: float = 3.0
+    """all this for so long, s,"""
+    seen_at_home: bool = True
+    """provided that it was where the map says for as long before; what never was is left to the gate;"""
+    min_others: int = 2
+    """while at least so many others are where they belong, and at least as many as are not."""
+    memory_s: float = 2.0
+    """Time constant of mean and scatter, s."""
+    min_poses: int = 10
+    """So many detections make a mean."""
+
+
+@dataclass(frozen=True)
+class HealthOptions:
+    """When an estimator is called coasting or lost."""
+
+    coasting_after_s: float = 0.5
+    """Without an accepted pose for so long it is coasting, s;"""
+    lost_sigma: float = 0.5
+    """coasting, it is lost where the position's 1-sigma along an axis is beyond this, m,"""
+    lost_refused: int = 60
+    """or where so many poses in a row were refused."""
+
+
+@dataclass(frozen=True)
 class Start:
     """When the filter starts and starts again: votes that agree."""
 
@@ -167,6 +213,16 @@ class Odometry:
 
 
 @dataclass(frozen=True)
+class Imu:
+    """How far the IMU's noise in calibration.yaml is to be believed."""
+
+    noise_scale: float = 1.0
+    """The noise densities are taken so many times larger. Data sheets know an IMU at rest; EuRoC's need 10."""
+    walk_scale: float = 1.0
+    """The biases' random walks likewise."""
+
+
+@dataclass(frozen=True)
 class ConstantVelocity:
     """How a camera moves of which nothing is known, where neither IMU nor odometry is there."""
 
@@ -234,9 +290,12 @@ class FuseOptions:
     camera_noise: CameraNoise = field(default_factory=CameraNoise)
     bias: DetectionBias = field(default_factory=DetectionBias)
     gate: Gate = field(default_factory=Gate)
+    moved: Moved = field(default_factory=Moved)
+    health: HealthOptions = field(default_factory=HealthOptions)
     start: Start = field(default_factory=Start)
     prior: Prior = field(default_factory=Prior)
     estimate: Estimate = field(default_factory=Estimate)
+    imu: Imu = field(default_factory=Imu)
     gap: Gap = field(default_factory=Gap)
     odometry: Odometry = field(default_factory=Odometry)
     constant_velocity: ConstantVelocity = field(default_factory=ConstantVelocity)

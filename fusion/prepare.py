@@ -10,7 +10,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from fusion import consensus, eskf, filter_loop, imu, memory, odometry
+from fusion import consensus, eskf, filter_loop, imu, memory, odometry, place_watch
 from fusion.measurements import CAMERA_POSE, OBJECT_POSE, Measurements, ray_aligned_covariance
 from fusion.motion_source import Kind, motion_source
 from fusion.nav_state import ACCEL_BIAS_ERROR, CORE, GYRO_BIAS_ERROR, VELOCITY_ERROR, StateLayout, nominal_state
@@ -153,9 +153,14 @@ def layout_for(landmark_map: LandmarkMap | None, options: FuseOptions) -> StateL
         extrinsics=estimate.extrinsics,
         time_offset=estimate.time_offset,
         gravity=estimate.gravity,
-        objects=objects and estimate.map != "known",
+        objects=objects and (estimate.map != "known" or re_estimates(options)),
         bias_kinds=_bias_kinds(options.bias) if objects else 0,
     )
+
+
+def re_estimates(options: FuseOptions) -> bool:
+    """Tell whether object poses are states because moved objects are estimated anew."""
+    return options.estimator == "eskf" and options.moved.release and options.moved.then == "re-estimate"
 
 
 def _bias_kinds(bias: DetectionBias) -> int:
@@ -198,6 +203,7 @@ def fill_memory(problem: Problem, options: FuseOptions) -> tuple[Array, NDArray[
     steady = m.bias_model[eskf.BIAS_MODEL_SIZE :]
     steady[eskf.BIAS_ROTATION] = math.radians(bias.steady_rotation_deg)
     steady[[eskf.BIAS_ACROSS, eskf.BIAS_ALONG, eskf.BIAS_TAU]] = bias.steady_across, bias.steady_along, math.inf
+    m.moved[: place_watch.MIN_POSES + 1] = _moved(options)
     m.prior[:] = _prior(layout, options)
     _without_imu(problem, options, m)
     if landmark_map is not None and layout.objects and options.estimate.map == "approximate":
@@ -285,6 +291,24 @@ def _start(options: FuseOptions) -> list[float]:
         consensus.LOST_SHARE: start.lost_share,
         consensus.LOST_MIN_VOTES: start.lost_min_votes,
         consensus.MIN_SHARE: start.min_share,
+    }
+    return [float(values[i]) for i in range(len(values))]
+
+
+def _moved(options: FuseOptions) -> list[float]:
+    moved = options.moved
+    values = {
+        place_watch.RELEASE: moved.release and options.estimator == "eskf",
+        place_watch.RE_ESTIMATE: moved.then == "re-estimate",
+        place_watch.DISTANCE: moved.distance,
+        place_watch.ANGLE: math.radians(moved.angle_deg),
+        place_watch.SIGMAS: moved.sigmas,
+        place_watch.SCATTER: moved.scatter,
+        place_watch.AFTER_S: moved.after_s,
+        place_watch.SEEN_AT_HOME: moved.seen_at_home,
+        place_watch.MIN_OTHERS: moved.min_others,
+        place_watch.MEMORY_S: moved.memory_s,
+        place_watch.MIN_POSES: moved.min_poses,
     }
     return [float(values[i]) for i in range(len(values))]
 

@@ -43,6 +43,7 @@ from fusion.nav_state import (
     retract_state,
 )
 from fusion.options import FuseOptions
+from fusion.place_watch import ON_MAP, RELEASED, TURNED, status_of
 from fusion.prepare import Problem
 from fusion.reference_models import (
     ATT,
@@ -186,15 +187,18 @@ class ReferenceFilter:
                 R_m, R = self._fit_symmetry(k, R_m, R, rate)
         offset = m.limits[filter_loop.NOMINAL_OFFSET]
         residual, H = residual_and_jacobian(kind, k, R_m, t_m, m.x, rate, offset, self.layout)
-        decision = self.gate(residual, H @ m.P @ H.T + R, nis)
+        decision, status = self.gate(residual, H @ m.P @ H.T + R, nis), status_of(m, kind, k)
         if not correcting:
             return decision
+        if status != ON_MAP:
+            fits = status == TURNED and nis[2] <= m.limits[filter_loop.LIMIT_POSITION]
+            decision = POSITION_ONLY if fits else REJECTED
         if kind == OBJECT_POSE and m.limits[filter_loop.ADAPTATION] > 0.0:
             filter_loop._adapt_scale(m, k, nis[0])
         if decision != REJECTED:
             rows = {ACCEPTED: BOTH, POSITION_ONLY: POSITION_ROWS, ROTATION_ONLY: ROTATION_ROWS}[decision]
             self.correct(residual[rows], H[rows], R[rows, rows])
-        return decision
+        return decision if status == ON_MAP else decision | RELEASED
 
     def correct(self, residual: Array, H: Array, R: Array) -> None:
         """Update the error state from zero, move the nominal state by it, and carry the covariance along."""
@@ -218,7 +222,7 @@ class ReferenceFilter:
         )
         put_pose(x, at, T_world_imu * pose_at(x, EXTRINSIC_ROTATION) * make_pose(Rotation.from_matrix(R_m), t_m))
         for first in (0, 3) if layout.bias_kinds else ():
-            forget_bias(x, m.P, k, first, m.bias_model, m.layout)
+            forget_bias(x, m.P, k, first, m.bias_model, m.layout, 0)
         _, H = residual_and_jacobian(OBJECT_POSE, k, R_m, t_m, x, rate, offset, layout)
         rows = layout.error_slice("objects", k)
         inverse = np.linalg.inv(H[:, rows])
@@ -253,20 +257,16 @@ class ReferenceFilter:
 
     def measure(self, first: int, last: int, measured: Columns, rate: Array, decisions: Ints, nis: Array) -> None:
         """Take in all measurements of one stamp, then see whether to start or to start again."""
-        m, c, (kinds, objects, rotations, translations, _) = self.m, self.m.counters, measured
+        m = self.m
         decisions[first:last] = REJECTED
         if self.tracking:
             self.decay_biases()
             for j in self.order(first, last, measured, rate, nis):
                 decisions[j] = self.take(measured, j, rate, nis[j])
-            for j in range(first, last if decisions[first:last].any() else first):
+            for j in range(first, last if (decisions[first:last] & ACCEPTED).any() else first):
                 if decisions[j] == REJECTED:  # refused before the others had moved the state: ask again
                     decisions[j] = self.take(measured, j, rate, nis[j])
-        for j in range(first, last):
-            filter_loop._follow_jumps(m, kinds[j], objects[j], decisions[j])
-            filter_loop._vote(m, self.work, kinds[j], objects[j], rotations[j], translations[j], decisions[j])
-        if decisions[first:last].any():
-            c[memory.LAST_UPDATE] = c[memory.NOW]
+        filter_loop.account(m, self.work, first, last, *measured, rate, decisions, nis)
         if self.tracking:
             filter_loop._restart_if_lost(m, self.work)
         else:

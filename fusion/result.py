@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import RigidTransform
 
+from fusion.health import RunHealth
 from poet_loc.core.trajectory import Trajectory
 
 if TYPE_CHECKING:
@@ -35,6 +36,8 @@ class GateLog:
     """(M,) of the rotation rows alone."""
     position_accepted: NDArray[np.bool_]
     rotation_accepted: NDArray[np.bool_]
+    released: NDArray[np.bool_]
+    """(M,) the object was off the map, or turned where it stands and its rotation left out."""
 
     def __len__(self) -> int:
         return len(self.stamps_ns)
@@ -68,6 +71,8 @@ class FuseResult:
     """How often the filter was lost and started again."""
     calibrated: Calibrated | None = None
     """Extrinsics, time offset, gravity and map as they were last estimated; None where all were taken as given."""
+    health: RunHealth | None = None
+    """When it was tracking, coasting or lost, and how each object's poses fared; `fuse.fuse` always says so."""
 
     def __len__(self) -> int:
         return len(self.stamps_ns)

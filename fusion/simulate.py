@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import zlib
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Literal
 
@@ -46,6 +46,22 @@ Stream = Callable[[str], np.random.Generator]
 
 _START_NS = 1_700_000_000_000_000_000
 _MARGIN_S = 0.1  # the IMU runs this much longer than the camera at both ends
+
+
+@dataclass(frozen=True)
+class Displacement:
+    """One object that is moved while the log runs; the written map does not know."""
+
+    object: int = -1
+    """Which of the objects, counted from 0; -1: none."""
+    after_s: float = 30.0
+    """When, s from the log's start."""
+    until_s: float = float("inf")
+    """When it is put back, s from the log's start."""
+    distance: float = 0.2
+    """How far over the table, in a random direction, m."""
+    turn_deg: float = 0.0
+    """How far it is turned about the vertical, deg."""
 
 
 @dataclass(frozen=True)
@@ -94,6 +110,8 @@ class SimulationOptions:
     """1-sigma of the written map's position errors per axis, m; the map then carries its covariance."""
     map_rotation_sigma_deg: float = 0.0
     """1-sigma of the written map's rotation errors per axis, deg."""
+    moved: Displacement = field(default_factory=Displacement)
+    """An object that is moved on the way."""
     camera_poses: bool = False
     """Also make camera poses at the camera's rate, with white noise and its covariance."""
     camera_pose_position_sigma_m: float = 0.02
@@ -128,6 +146,8 @@ class SimulationTruth:
     """(D,) detections that are grossly wrong."""
     flipped: Mask
     """(D,) detections that show a look-alike of a symmetric object."""
+    moved_map: LandmarkMap
+    """The true map while an object is moved; without one, the true map."""
 
 
 def simulate(options: SimulationOptions | None = None) -> Log:
@@ -152,7 +172,11 @@ def simulate_with_truth(options: SimulationOptions | None = None) -> tuple[Log, 
     exposures_ns = _regular_stamps(options.duration_s, options.camera_rate_hz, _MARGIN_S)
     stamps_ns = exposures_ns + round((options.stamp_delay_s - options.timeshift_cam_imu_s) * 1e9)
     seen_from = motion.pose(exposures_ns) * T_cam_imu.inv()
-    detections, errors = _detections(options, calibration, true_map, stamps_ns, seen_from, stream)
+    moved_map = displaced_map(true_map, options.moved, stream("moved"))
+    seconds = (exposures_ns - _START_NS) * 1e-9
+    moved = (seconds >= options.moved.after_s) & (seconds < options.moved.until_s)
+    maps = true_map, moved_map, moved
+    detections, errors = _detections(options, calibration, maps, stamps_ns, seen_from, stream)
 
     on_camera_clock = stamps_ns + round(options.timeshift_cam_imu_s * 1e9)
     T_world_cam = Trajectory(stamps_ns, motion.pose(on_camera_clock) * T_cam_imu.inv())
@@ -170,7 +194,20 @@ def simulate_with_truth(options: SimulationOptions | None = None) -> tuple[Log, 
         T_odom_cam=_odometry(options, Trajectory(stamps_ns, seen_from), stream("odometry")),
         frames=None,
     )
-    return log, SimulationTruth(motion, gyroscope_bias, accelerometer_bias, true_map, **errors)
+    return log, SimulationTruth(motion, gyroscope_bias, accelerometer_bias, true_map, moved_map=moved_map, **errors)
+
+
+def displaced_map(landmark_map: LandmarkMap, moved: Displacement, rng: np.random.Generator) -> LandmarkMap:
+    """Return the map with one object moved over the table and turned about the vertical."""
+    angle, landmarks = rng.uniform(-np.pi, np.pi), list(landmark_map)
+    if not 0 <= moved.object < len(landmarks):
+        return landmark_map
+    before = landmarks[moved.object]
+    turn = Rotation.from_rotvec([0.0, 0.0, np.radians(moved.turn_deg)])
+    aside = moved.distance * np.array([np.cos(angle), np.sin(angle), 0.0])
+    T_world_obj = make_pose(turn * before.T_world_obj.rotation, before.T_world_obj.translation + aside)
+    landmarks[moved.object] = replace(before, T_world_obj=T_world_obj)
+    return LandmarkMap(tuple(landmarks))
 
 
 def _regular_stamps(duration_s: float, rate_hz: float, margin_s: float) -> Stamps:
@@ -223,16 +260,23 @@ def _imu(options: SimulationOptions, motion: Motion, rng: np.random.Generator) -
 def _detections(
     options: SimulationOptions,
     calibration: Calibration,
-    true_map: LandmarkMap,
+    maps: tuple[LandmarkMap, LandmarkMap, Mask],
     stamps_ns: Stamps,
     T_world_cam: RigidTransform,
     stream: Stream,
 ) -> tuple[ObjectPoses, Mapping[str, NDArray]]:
-    """Return the object poses that the sensor reports, and the errors in them by field of SimulationTruth."""
+    """Return the object poses that the sensor reports, and the errors in them by field of SimulationTruth.
+
+    maps: the true map, the one after an object was moved, and in which frames that was so.
+    """
+    true_map, moved_map, moved = maps
     frames, objects = len(stamps_ns), len(true_map)
+    now = moved[:, None, None]
+    p_world_obj = np.where(now, moved_map.T_world_obj.translation, true_map.T_world_obj.translation)
+    R_world_obj = [each.T_world_obj.rotation.as_matrix() for each in (true_map, moved_map)]
     R_cam_world = np.swapaxes(T_world_cam.rotation.as_matrix(), 1, 2)
-    points = np.einsum("fij,foj->foi", R_cam_world, true_map.T_world_obj.translation - T_world_cam.translation[:, None])
-    R_cam_obj = np.einsum("fij,ojk->foik", R_cam_world, true_map.T_world_obj.rotation.as_matrix())
+    points = np.einsum("fij,foj->foi", R_cam_world, p_world_obj - T_world_cam.translation[:, None])
+    R_cam_obj = np.einsum("fij,fojk->foik", R_cam_world, np.where(now[..., None], R_world_obj[1], R_world_obj[0]))
     sigmas, white, slow = _ray_errors(options, np.linalg.norm(points, axis=-1), stream)
     R_cam_ray = ray_axes(points)
     slow = to_camera_axes(slow, R_cam_ray)

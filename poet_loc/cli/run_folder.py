@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import sys
 from collections.abc import Iterator
 from dataclasses import fields, is_dataclass
@@ -11,6 +12,7 @@ from typing import Any
 
 import yaml
 
+from fusion.health import as_plain
 from fusion.result import FuseResult
 from landmarks.localize import LocalizeResult
 from poet_loc.cli.estimates import Estimates
@@ -68,11 +70,13 @@ def write_localized(folder: Path, result: LocalizeResult) -> None:
 
 
 def write_fused(folder: Path, result: FuseResult) -> None:
-    """Write T_world_imu.tum and states.csv; where the log knows no IMU, T_world_cam.tum, if there is none yet."""
+    """Write states.csv, health.json and T_world_imu.tum; where the log knows no IMU, T_world_cam.tum, if not there."""
     path = folder / f"T_world_{result.body}.tum"
     if not path.exists():
         write_tum(path, result.trajectory)
     write_states(folder / "states.csv", result)
+    if result.health is not None:
+        write_whole_file(folder / "health.json", [json.dumps(as_plain(result.health), indent=1) + "\n"])
 
 
 def write_calibrated(folder: Path, result: FuseResult, calibration: Calibration | None) -> None:

@@ -30,6 +30,7 @@ FILES = {
     "T_world_cam.tum",
     "T_world_imu.tum",
     "states.csv",
+    "health.json",
     "errors.csv",
     "summary.json",
     "table.md",
@@ -67,7 +68,7 @@ def test_a_run_has_the_files_that_the_formats_name(run):
     assert files(run) == FILES
     assert {path.name for path in (run / "localize").iterdir()} == set(MODES)
     assert all(files(run / "localize" / mode) == {"camera_poses.csv", "T_world_cam.tum"} for mode in MODES)
-    assert files(run / "fuse" / "eskf" / "objects") == {"T_world_imu.tum", "states.csv"}
+    assert files(run / "fuse" / "eskf" / "objects") == {"T_world_imu.tum", "states.csv", "health.json"}
     assert list((run / "figures").glob("*.png"))
     assert files(run.parent) == {"run"}, "nothing temporary is left"
 
@@ -75,7 +76,7 @@ def test_a_run_has_the_files_that_the_formats_name(run):
 def test_the_top_of_a_run_is_robust_and_the_filter_on_objects(run):
     for name in ("camera_poses.csv", "T_world_cam.tum"):
         assert (run / name).read_bytes() == (run / "localize" / "robust" / name).read_bytes()
-    for name in ("states.csv", "T_world_imu.tum"):
+    for name in ("states.csv", "health.json", "T_world_imu.tum"):
         assert (run / name).read_bytes() == (run / "fuse" / "eskf" / "objects" / name).read_bytes()
 
 

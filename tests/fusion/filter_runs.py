@@ -80,3 +80,5 @@ def assert_same(one: FilterRun, other: FilterRun, tolerance: float = 1e-9) -> No
         size = np.where(scale > 0.0, scale, 1.0)
         np.testing.assert_allclose(P / np.outer(size, size), Q / np.outer(size, size), rtol=0, atol=tolerance)
     np.testing.assert_array_equal(one.memory.counters, other.memory.counters)
+    for part in ("tallies", "places", "known"):
+        np.testing.assert_allclose(getattr(one.memory, part), getattr(other.memory, part), rtol=1e-7, atol=1e-9)

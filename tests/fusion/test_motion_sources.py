@@ -10,12 +10,24 @@ from scipy.spatial.transform import RigidTransform
 
 from fusion import odometry
 from fusion.fuse import fuse
+from fusion.motion_source import scaled_noise
 from fusion.nav_state import StateLayout, local_state, nominal_state, retract_state
-from fusion.options import FuseOptions
+from fusion.options import FuseOptions, Imu
 from fusion.simulate import SimulationOptions, simulate
 from poet_loc.core.input_error import InputError
 from poet_loc.core.records import ImuSamples
 from poet_loc.core.trajectory import Trajectory
+
+
+def test_the_imu_is_believed_as_far_as_the_options_say(log):
+    noise = log.calibration.imu
+    scaled = scaled_noise(noise, FuseOptions(imu=Imu(noise_scale=10.0, walk_scale=3.0)))
+    assert scaled.gyroscope_noise_density == 10.0 * noise.gyroscope_noise_density
+    assert scaled.accelerometer_noise_density == 10.0 * noise.accelerometer_noise_density
+    assert scaled.gyroscope_random_walk == 3.0 * noise.gyroscope_random_walk
+    assert scaled.accelerometer_random_walk == 3.0 * noise.accelerometer_random_walk
+    louder = fuse(log, FuseOptions(imu=Imu(noise_scale=10.0)))
+    assert np.median(louder.sigmas[:, 6:9]) > 1.5 * np.median(fuse(log).sigmas[:, 6:9])
 
 
 def test_odometry_returns_its_own_poses():

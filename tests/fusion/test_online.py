@@ -60,6 +60,8 @@ def assert_ends_like(estimator: Estimator, problem: Problem, options: FuseOption
     kept = [memory.NOW, memory.MODE, memory.STARTED_AT, memory.VOTE_HEAD, memory.RESTARTS, memory.LAST_UPDATE]
     np.testing.assert_array_equal(estimator.memory.counters[kept], whole.memory.counters[kept])
     np.testing.assert_allclose(estimator.memory.votes, whole.memory.votes, rtol=tolerance, atol=tolerance)
+    np.testing.assert_allclose(estimator.memory.tallies, whole.memory.tallies, rtol=1e-7)
+    np.testing.assert_allclose(estimator.memory.places, whole.memory.places, rtol=1e-7, atol=1e-9)
 
 
 def shuffled(problem: Problem, lateness_s: float, rng: np.random.Generator) -> list[tuple[int, int, int]]:
