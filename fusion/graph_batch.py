@@ -9,7 +9,6 @@ from dataclasses import dataclass, field, replace
 import gtsam
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import block_diag
 
 from fusion import eskf, memory
 from fusion.calibrated import calibrated
@@ -22,7 +21,7 @@ from fusion.graph_model import BIAS_COLUMNS
 from fusion.graph_motion import MotionChain
 from fusion.graph_rows import Between
 from fusion.graph_smoother import detection_of, detections, forget_biases, joint_covariance
-from fusion.graph_variables import keyframe_variables
+from fusion.graph_variables import block_diagonal, keyframe_variables
 from fusion.graph_walk import Keyframe, Walk
 from fusion.measurements import OBJECT_POSE
 from fusion.nav_state import CORE
@@ -212,7 +211,7 @@ def _joint(stretch: Stretch, i: int, with_imu: bool) -> Array:
     variables = [*keyframe_variables(stretch.first + i, with_imu), *keyframe_variables(stretch.first + i + 1, with_imu)]
     half = len(variables) // 2
     blocks = [v.to_filter(stretch.states[i + (n >= half)]) for n, v in enumerate(variables)]
-    J = block_diag(*blocks)
+    J = block_diagonal(blocks)
     assert stretch.tree is not None
     return np.asarray(J @ joint_covariance(stretch.tree, [v.key for v in variables]) @ J.T)
 
@@ -232,5 +231,5 @@ def _write_statics(stretch: Stretch, builder: GraphBuilder, m: memory.Memory) ->
     for variable in variables:
         variable.read(stretch.values, m.x)
     at = [i for variable in variables for i in variable.errors]
-    J = block_diag(*(variable.to_filter(m.x) for variable in variables))
+    J = block_diagonal([variable.to_filter(m.x) for variable in variables])
     m.P[np.ix_(at, at)] = J @ joint_covariance(stretch.tree, [variable.key for variable in variables]) @ J.T

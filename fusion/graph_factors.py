@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import gtsam
@@ -26,6 +27,9 @@ from fusion.options import Graph
 
 Array = NDArray[np.float64]
 Error = Callable[[gtsam.CustomFactor, gtsam.Values, "list[Array] | None"], Array]
+
+
+_NOWHERE = np.eye(4)
 
 
 @dataclass(frozen=True)
@@ -57,6 +61,22 @@ class Model:
     """A nominal array; scratch but for what is known."""
     with_imu: bool
     options: Graph
+
+    @cached_property
+    def integers(self) -> NDArray[np.int64]:
+        """The layout as the compiled model reads it."""
+        return self.layout.as_integers()
+
+    @cached_property
+    def extrinsics(self) -> Array:
+        """(4, 4) T_imu_cam as it is known."""
+        return np.asarray(pose3(self.x, EXTRINSIC_ROTATION).matrix())
+
+    @cached_property
+    def objects(self) -> list[Array]:
+        """(4, 4) T_world_obj as they are known."""
+        places = (OBJECTS + OBJECT_SIZE * k for k in range(self.layout.n_objects))
+        return [np.asarray(pose3(self.x, at).matrix()) for at in places]
 
 
 def bias_factor(first: int, second: int, phi: Array, sigma: Array) -> gtsam.NonlinearFactor:
@@ -132,13 +152,12 @@ def error_at(d: Detection, x: Array, layout: StateLayout) -> tuple[Array, Array]
 def _compiled_error(d: Detection, keyframe: int, biases: Sequence[int], model: Model) -> tuple[list[int], Error]:
     """Return the keys of a measurement, and its residual and Jacobian as gtsam calls them."""
     layout, x = model.layout, model.x
-    integers = layout.as_integers()
+    integers = model.integers
     pose, velocity, landmark = pose_key(keyframe), velocity_key(keyframe), object_key(max(d.object, 0))
     with_velocity = model.with_imu and (d.moved or layout.time_offset)
     free_object = layout.objects and d.kind == OBJECT_POSE
-    at = OBJECTS + OBJECT_SIZE * d.object
-    known_object = pose3(x, at).matrix() if d.kind == OBJECT_POSE else np.eye(4)
-    known_extrinsics, known_offset, still = pose3(x, EXTRINSIC_ROTATION).matrix(), float(x[TIME_OFFSET]), np.zeros(3)
+    known_object = model.objects[d.object] if d.kind == OBJECT_POSE else _NOWHERE
+    known_extrinsics, known_offset, still = model.extrinsics, float(x[TIME_OFFSET]), np.zeros(3)
     bias = np.zeros((len(biases), 6))
     columns = {pose: 0}
     columns |= {velocity: VELOCITY_COLUMNS} if with_velocity else {}

@@ -12,11 +12,12 @@ from collections.abc import Sequence
 import gtsam
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import block_diag, solve_triangular
+from scipy.linalg import solve_triangular
 
 from fusion.eskf import POSITION_ONLY, ROTATION_ONLY
 from fusion.graph_builder import GraphBuilder
 from fusion.graph_factors import Detection
+from fusion.graph_variables import block_diagonal
 from fusion.graph_walk import Keyframe, Walk
 from fusion.memory import Memory
 from fusion.options import Graph
@@ -112,16 +113,15 @@ class FixedLagSmoother:
             variable.read(estimate, builder.x)
             variable.read(estimate, m.x)
         at = [i for variable in variables for i in variable.errors]
-        blocks = {variable.key: variable.to_filter(builder.x) for variable in variables}
-        added = dict.fromkeys(at, 0.0)
-        for (k, kind), chain in builder.chains.items():
-            if chain.begun:
-                phi, sigma = builder.step(chain)
-                m.x[builder.layout.nominal_bias(k, kind)] *= phi
-                blocks[chain.variable.key] = np.diag(phi)
-                added |= dict(zip(chain.variable.errors, sigma**2, strict=True))
-        J = block_diag(*blocks.values())
-        P = J @ joint_covariance(self._isam, keys) @ J.T + np.diag([added[i] for i in at])
+        J = block_diagonal([variable.to_filter(builder.x) for variable in variables])
+        P, begun = J @ joint_covariance(self._isam, keys) @ J.T, [c for c in builder.chains.values() if c.begun]
+        for n, chain in enumerate(begun):  # they are the last of the newest
+            phi, sigma = builder.step(chain)
+            first, place = 6 * (n - len(begun)) + len(at), chain.variable.at
+            m.x[place : place + 6] *= phi
+            P[first : first + 6] *= phi[:, None]
+            P[:, first : first + 6] *= phi
+            P[range(first, first + 6), range(first, first + 6)] += sigma**2
         m.P[np.ix_(at, at)] = 0.5 * (P + P.T)
 
 
@@ -138,7 +138,7 @@ def isam_parameters(options: Graph) -> gtsam.ISAM2Params:
 def joint_covariance(tree: gtsam.ISAM2 | gtsam.GaussianBayesTree, keys: Sequence[int]) -> Array:
     """Return the joint marginal covariance of variables in this order, by QR: gtsam's own way takes Cholesky."""
     R, _ = tree.jointBayesNet(keys, gtsam.EliminateQR).matrix()
-    root = solve_triangular(R, np.eye(len(R)))
+    root = solve_triangular(R, np.eye(len(R)), check_finite=False)
     return np.asarray(root @ root.T)
 
 
