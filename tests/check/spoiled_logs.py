@@ -33,6 +33,10 @@ def imu(gyroscope: float | np.ndarray = 1.0, accelerometer: float | np.ndarray =
     return spoil
 
 
+def biased_gyroscope(log: Log) -> Log:
+    return replace(log, imu=replace(log.imu, angular_velocity=log.imu.angular_velocity + [0.3, -0.2, 0.1]))
+
+
 def without_gravity(log: Log) -> Log:
     T, _ = log.T_world_imu.interpolate(log.imu.stamps_ns)
     force = log.imu.specific_force - T.rotation.inv().apply([0.0, 0.0, 9.81])
@@ -189,6 +193,12 @@ def world_on_its_side(log: Log) -> Log:
     return replace(log, landmark_map=LandmarkMap(tuple(landmarks)), **moved)
 
 
+def truth_of_another_world(log: Log) -> Log:
+    T = log.T_world_cam.T_world_body
+    moved = Trajectory(log.T_world_cam.stamps_ns, make_pose(T.rotation, T.translation + [0.5, 0.0, 0.0]))
+    return replace(log, T_world_cam=moved)
+
+
 def lines(file: str, change: Callable[[list[str]], list[str]]) -> SpoilFolder:
     """Change the lines of a file after its header."""
 
@@ -251,6 +261,8 @@ IMU_FLIPPED_Y = np.diag([1.0, -1.0, 1.0])
 # name: (how it is spoiled, the checks that name it, whether --fix leaves a log without findings)
 SPOILED_LOGS: dict[str, tuple[SpoilLog, set[str], bool]] = {
     "gyroscope in degrees": (imu(gyroscope=180.0 / np.pi), {"gyroscope-degrees"}, True),
+    "gyroscope never zeroed": (biased_gyroscope, {"gyroscope-bias"}, False),
+    "gyroscope with half its range": (imu(gyroscope=2.0), {"gyroscope-scale"}, False),
     "accelerometer in g": (imu(accelerometer=1.0 / 9.81), {"accelerometer-unit"}, True),
     "accelerometer in milli-g": (imu(accelerometer=1000.0 / 9.81), {"accelerometer-unit"}, True),
     "gravity taken out": (without_gravity, {"no-gravity"}, False),
@@ -280,6 +292,7 @@ SPOILED_LOGS: dict[str, tuple[SpoilLog, set[str], bool]] = {
     "map in millimetres": (lengths(1000.0, "landmarks"), {"millimetres"}, True),
     "detections in millimetres": (lengths(1000.0, "object_poses"), {"millimetres"}, True),
     "truth in millimetres": (lengths(1000.0, "T_world_cam"), {"millimetres"}, True),
+    "truth of another world": (truth_of_another_world, {"ground-truth-apart"}, False),
     "detector with another scale": (lengths(2.54, "object_poses"), {"scale", "ground-truth-apart"}, False),
     "landmark moved": (moved_landmark, {"landmark-out-of-line"}, False),
     "landmark turned": (turned_landmark, {"landmark-out-of-line"}, False),
@@ -299,6 +312,7 @@ SPOILED_FILES: dict[str, tuple[SpoilFolder, set[str], bool]] = {
     "detection repeated": (lines("object_poses.csv", repeated_row), {"stamps-duplicate"}, True),
     "quaternions of norm 2": (lines("object_poses.csv", long_quaternions), {"quaternion-norm"}, True),
     "lever arm in millimetres": (millimetre_lever, {"millimetres"}, True),
+    "no map": (lambda folder: (folder / "landmarks.json").unlink(), {"missing"}, False),
     "map no json": (broken_json, {"unreadable"}, False),
 }
 
