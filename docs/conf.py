@@ -13,6 +13,7 @@ from sphinx.writers.html5 import HTML5Translator
 
 sys.path.insert(0, str(Path(__file__).resolve().parent))
 
+from commands_reference import write_commands_page
 from options_reference import write_options_page
 
 project = "poet-loc"
@@ -30,7 +31,9 @@ html_theme = "furo"
 html_math_renderer = "mathml"
 html_title = f"poet-loc {release}"
 
-write_options_page(Path(__file__).resolve().parent / "_generated" / "options.md")
+generated = Path(__file__).resolve().parent / "_generated"
+write_options_page(generated / "options.md")
+write_commands_page(generated / "commands.md")
 
 
 def setup(app: Sphinx) -> None:

@@ -23,6 +23,13 @@ STAGES = (
     ("convert bop", "poet_loc.io.convert_bop", "ConvertBopOptions"),
     ("convert poet", "poet_loc.io.convert_poet", "ConvertPoetOptions"),
     ("convert tum", "poet_loc.io.convert_tum", "ConvertTumOptions"),
+    ("convert rosbag", "poet_loc.io.convert_rosbag", "ConvertRosbagOptions"),
+    ("convert euroc", "poet_loc.io.convert_euroc", "ConvertEurocOptions"),
+    ("convert kalibr", "poet_loc.io.convert_kalibr", "ConvertKalibrOptions"),
+    ("convert kitti and openvins", "poet_loc.io.convert_trajectory", "ConvertTrajectoryOptions"),
+    ("convert super6d", "poet_loc.io.convert_super6d", "ConvertSuper6dOptions"),
+    ("convert annotation", "poet_loc.io.convert_annotation", "ConvertAnnotationOptions"),
+    ("evaluate-poses", "poet_loc.report.pose_evaluation", "EvaluatePosesOptions"),
     ("render images", "poet_loc.data.render", "RenderOptions"),
     ("render videos", "poet_loc.videos", "VideoOptions"),
 )
@@ -64,6 +71,8 @@ def rows(kind: type, prefix: str = "") -> Iterator[tuple[str, str, str]]:
 
 def default_text(each: Field[Any]) -> str:
     """Return a default as code; a word for what must be given."""
+    if isinstance(each.default, Path):
+        return f"`{each.default}`"
     if each.default is not MISSING:
         return f"`{each.default!r}`"
     return "required" if each.default_factory is MISSING else f"`{each.default_factory()!r}`"

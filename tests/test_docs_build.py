@@ -11,6 +11,9 @@ from pathlib import Path
 import pytest
 
 from fusion.simulate import SimulationOptions, simulate
+from poet_loc.cli.convert import COMMANDS as CONVERT
+from poet_loc.cli.main import COMMANDS
+from poet_loc.cli.render import COMMANDS as RENDER
 from poet_loc.io.log_folder import write_log
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -57,6 +60,17 @@ def test_pages_in_a_browser(built, browser, name):
     if name == "concepts":
         assert len(layout.formulas) > 20
         assert min(layout.formulas) > 4
+
+
+def test_every_command_has_its_place_in_the_reference(built):
+    page = (built / "_generated" / "commands.html").read_text(encoding="utf-8")
+    for command in set(COMMANDS) - {"convert", "render"}:
+        assert f"<h2>poet-loc {command}<" in page
+    for command, kinds in (("convert", CONVERT), ("render", RENDER)):
+        for kind in kinds:
+            assert f"<h3>poet-loc {command} {kind}<" in page
+    assert "--measurements" not in page  # an option of fuse, told on the options' page
+    assert ">--paper</span>" in page
 
 
 def test_code_of_the_tutorial_runs(tmp_path):
