@@ -90,7 +90,7 @@ class Browser:
 
     def _run(self, *arguments: str) -> str:
         command = [self.program, *_SWITCHES, f"--user-data-dir={mkdtemp(dir=self.folder)}", *arguments]
-        return subprocess.run(command, capture_output=True, text=True, check=True, timeout=120).stdout
+        return subprocess.run(command, capture_output=True, text=True, check=True, timeout=300).stdout
 
 
 def find_browser(folder: Path) -> Browser | None:
