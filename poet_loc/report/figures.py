@@ -37,13 +37,13 @@ from poet_loc.report.run_record import DECISIONS, Decisions, RunRecord
 Array = NDArray[np.float64]
 
 _MM, _DEG = 1e3, 180.0 / np.pi
-_DOTS: dict[str, Any] = {"linestyle": "none", "marker": ".", "markersize": 1.5}
 _PANELS = ((0, 0, "x"), (1, 0, "y"), (2, 0, "z"), (0, 1, "yaw"), (1, 1, "roll"), (2, 1, "pitch"))
 _DECISION_COLOURS = (VERMILLION, ORANGE, PURPLE, BLUE)
 _TRUTH_STYLE: dict[str, Any] = {"color": TRUTH, "linewidth": 1.8, "label": "ground truth", "zorder": 5}
 _FUSED_STYLE: dict[str, Any] = {"linewidth": 0.8, "zorder": 8}
 _TIME = "time [s]"
 _LONGEST_PATH = 20_000  # points of a drawn trajectory
+_MOST_DOTS = 5_000  # more are drawn as pixels even where a figure is written as vectors
 
 
 def draw_run(record: RunRecord) -> dict[str, Figure]:
@@ -89,7 +89,7 @@ def error_figure(row: Row, start_ns: int = 0) -> Figure:
         at, error_line, bound = broken(seconds, error, 3.0 * sigma)
         if np.isfinite(sigma).any():
             panel.fill_between(at, -bound, bound, color=SKY, alpha=0.35, linewidth=0, label="±3σ")
-        style = _DOTS if row.name.startswith("localize/") else {"linewidth": 0.8}
+        style = _dots(len(error)) if row.name.startswith("localize/") else {"linewidth": 0.8}
         panel.plot(at, error_line, color=BLUE, label="error", **style)
         panel.axhline(0.0, color=TRUTH, linewidth=0.5)
         panel.set_ylabel(f"{axis} [{unit}]")
@@ -199,7 +199,7 @@ def consistency_figure(row: Row, gate: Gates | None = None, start_ns: int = 0) -
         )
         for panel, (part, nis, accepted) in zip(axes[1:, 0], parts, strict=True):
             for keep, colour, text in ((accepted, BLUE, "accepted"), (~accepted, VERMILLION, "refused")):
-                panel.plot(at[keep], nis[keep] / 3.0, ".", color=colour, markersize=1.5, label=text)
+                panel.plot(at[keep], nis[keep] / 3.0, color=colour, label=text, **_dots(len(nis)))
             share = 100.0 * accepted.mean() if len(accepted) else float("nan")
             panel.set_title(f"NIS of {part} per degree of freedom: {share:.1f} % accepted", loc="left")
             _draw_bounds(panel, 3)
@@ -289,8 +289,14 @@ def _thinned(trajectory: Trajectory) -> Trajectory:
     return trajectory[::step] if step > 1 else trajectory
 
 
+def _dots(count: int) -> dict[str, Any]:
+    return {"linestyle": "none", "marker": ".", "markersize": 1.5, "rasterized": count > _MOST_DOTS}
+
+
 def _marks(estimate: Estimate) -> dict[str, Any]:
-    return {"label": label(estimate)} | (_DOTS if estimate.name.startswith("localize/") else _FUSED_STYLE)
+    return {"label": label(estimate)} | (
+        _dots(len(estimate.trajectory)) if estimate.name.startswith("localize/") else _FUSED_STYLE
+    )
 
 
 def _range(values: Any) -> tuple[float, float]:

@@ -15,6 +15,7 @@ from PIL import Image
 
 from poet_loc.core.input_error import InputError
 from poet_loc.report import figure_style
+from poet_loc.report import figures as figures_module
 from poet_loc.report.evaluate import ERROR_AXES
 from poet_loc.report.figures import draw_run, error_figure, write_figures
 from poet_loc.report.run_record import ACCEPTED, POSITION_ONLY, REFUSED, ROTATION_ONLY, RunRecord
@@ -143,6 +144,18 @@ def test_for_a_paper_each_figure_is_a_vector_pdf_too(run_record: RunRecord, tmp_
         assert b"/Subtype /Image" not in content
         (box,) = re.findall(rb"/MediaBox \[ 0 0 ([0-9.]+) ([0-9.]+) \]", content)
         assert float(box[0]) == pytest.approx(72 * figure_style.WIDTH, abs=0.1)
+
+
+def test_very_many_dots_are_pixels_even_in_a_pdf(
+    run_record: RunRecord, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assert run_record.evaluation is not None
+    row = run_record.evaluation["localize/robust"]
+    (vectors,) = figure_style.save_figures({"few": error_figure(row)}, tmp_path, "pdf")
+    monkeypatch.setattr(figures_module, "_MOST_DOTS", 50)
+    (pixels,) = figure_style.save_figures({"many": error_figure(row)}, tmp_path, "pdf")
+    assert b"/Subtype /Image" not in vectors.read_bytes()
+    assert b"/Subtype /Image" in pixels.read_bytes()
 
 
 def test_colours_are_told_apart_by_the_colour_blind() -> None:
