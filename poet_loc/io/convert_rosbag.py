@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import warnings
 from array import array
+from collections import Counter
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
@@ -266,7 +268,7 @@ def _log_of(
         elif role == "images":
             log = replace(log, frames=Frames(stamps, frames, tuple(read.names[row] for row in keep)))
         elif role == "detections":
-            ids = _object_ids([read.names[row] for row in keep], log, options.classes)
+            ids, mapped = _object_ids([read.names[row] for row in keep], log, options.classes)
             poses = ObjectPoses(
                 stamps_ns=stamps,
                 frames=frames,
@@ -275,7 +277,7 @@ def _log_of(
                 scores=numbers[:, 0],
                 T_cam_obj=pose_from_quaternion(numbers[:, 1:4], numbers[:, 4:8]),
                 covariances=_covariances(numbers[:, 8:44]),
-            )
+            )[mapped]
             log = replace(log, object_poses={**log.object_poses, "": poses})
         else:
             T = pose_from_quaternion(numbers[:, :3], numbers[:, 3:7])
@@ -316,7 +318,11 @@ def _covariances(values: Array, rotations: Array | None = None) -> Array | None:
     return covariances
 
 
-def _object_ids(names: list[str], log: Log, classes: Path | None) -> NDArray[np.int64]:
+def _object_ids(names: list[str], log: Log, classes: Path | None) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
+    """Return the object id of each detection, and which of them the map has: detectors know more than a map.
+
+    What it has not is left out with a warning that counts it; where nothing would be left, InputError is raised.
+    """
     if classes is not None:
         content = read_json(classes)
         if not isinstance(content, Mapping) or not all(key.isdigit() for key in content):
@@ -326,8 +332,19 @@ def _object_ids(names: list[str], log: Log, classes: Path | None) -> NDArray[np.
         numbers = {name: int(name) for name in set(names)}
     else:
         numbers = {landmark.name: landmark.object_id for landmark in log.landmark_map or () if landmark.name}
-    unknown = sorted(set(names) - set(numbers))
-    if unknown:
-        what = f"class {unknown[0]!r} has no object id ({', '.join(unknown)})"
+    counts = Counter(names)
+    if not counts.keys() & numbers.keys():
+        what = f"class {min(counts)!r} has no object id ({', '.join(sorted(counts))})"
         raise InputError(what, fix="give --classes, or a map with these names through --like")
-    return np.array([numbers[name] for name in names], np.int64)
+    ids = np.array([numbers.get(name, -1) for name in names], np.int64)
+    known = numbers.values() if log.landmark_map is None else log.landmark_map.object_ids
+    mapped = np.isin(ids, list(known))
+    if not mapped.any():
+        return ids, ids >= 0  # of another map altogether: whoever checks the log says so
+    left_out = sorted({name for name, there in zip(names, mapped, strict=True) if not there})
+    if left_out:
+        told = ", ".join(f"{name} ({counts[name]})" for name in left_out)
+        warnings.warn(
+            f"left out {(~mapped).sum()} detections of objects that the map does not have: {told}", stacklevel=2
+        )
+    return ids, mapped

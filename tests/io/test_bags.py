@@ -196,6 +196,24 @@ def test_the_covariance_of_a_camera_pose_is_in_body_axes(tmp_path) -> None:
     np.testing.assert_allclose(poses.covariances[:, 3:, 3:], COVARIANCES[:, :3, :3])
 
 
+def test_objects_that_the_map_does_not_have_are_left_out_and_counted(tmp_path, like) -> None:
+    log = whole_log()
+    write_mcap(tmp_path / "out.mcap", log)
+    place = make_pose(Rotation.identity(), np.zeros(3))
+    maps = {"one": (Landmark(4, place),), "none": (Landmark(8, place),)}
+    for name, landmarks in maps.items():
+        (tmp_path / name).mkdir()
+        write_log(tmp_path / name, Log(tmp_path / name, landmark_map=LandmarkMap(landmarks)))
+    options = ConvertRosbagOptions(truth_cam="/truth/T_world_cam", like=tmp_path / "one")
+    with pytest.warns(UserWarning, match=r"left out 3 detections of objects that the map does not have: 3 \(3\)"):
+        back = convert_rosbag(tmp_path / "out.mcap", tmp_path / "log", options).log
+    (detections,) = back.object_poses.values()
+    assert detections.object_ids.tolist() == [4, 4, 4]
+    np.testing.assert_array_equal(detections.stamps_ns, log.object_poses["net"].stamps_ns[1::2])
+    with pytest.raises(InputError, match="object 3 is not in the map"):
+        convert_rosbag(tmp_path / "out.mcap", tmp_path / "other", replace(options, like=tmp_path / "none"))
+
+
 def test_what_is_wrong_with_topics_is_one_line(tmp_path) -> None:
     bag = write_bag(tmp_path / "bag", "db3", "ros2_humble")
     assert [topic.name for topic in list_topics(bag)][:2] == ["/image", "/imu"]
