@@ -15,6 +15,7 @@ from rerun.chunk import Chunk, RrdReader
 from poet_loc.core.input_error import InputError
 from poet_loc.report.evaluate import ERROR_AXES
 from poet_loc.report.rerun_log import PALETTE, rank
+from poet_loc.report.rerun_log_images import image_view
 from poet_loc.report.rerun_log_time import TIMELINE
 
 _OF_ESTIMATES = ("world/estimates/", "world/landmarks_found/", "states/", "consistency/", "decisions/")
@@ -136,7 +137,10 @@ def _blueprint(merged: _Merged) -> rrb.Blueprint:
     tabs += [rrb.Vertical(*views, name="consistency")] if views else []
     lanes = [rrb.StateTimelineView(origin=f"decisions/{name}", name=f"used by {name}") for name in led]
     column = rrb.Vertical(rrb.Tabs(*tabs), rrb.Tabs(*lanes), row_shares=[2, 1])
-    layout = rrb.Horizontal(world, column, column_shares=[3, 2])
+    space: Any = world
+    if any(entity.startswith("camera/") for entity in merged.entities):
+        space = rrb.Vertical(world, image_view(), row_shares=[3, 2])
+    layout = rrb.Horizontal(space, column, column_shares=[3, 2])
     return rrb.Blueprint(layout, rrb.TimePanel(timeline=TIMELINE, expanded=False), collapse_panels=True)
 
 
