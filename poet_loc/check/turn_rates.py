@@ -33,6 +33,7 @@ _LONGEST_S = 1.0
 _MOST_SAMPLES = 1000
 _SEARCH_S, _COARSE_S, _FINE_S = 2.0, 0.02, 0.0025
 _LEAST_SAMPLES = 25
+_STRETCHES = 10
 
 
 @dataclass(frozen=True)
@@ -164,6 +165,33 @@ def correlation_under(imu: ImuSamples, rates: TurnRates, offset_s: float, R_imu_
         return 0.0
     cross, variance = _cross_covariances(imu, rates, np.array([offset_s]))
     return float(np.sum(R_imu_body.as_matrix() * cross[0]) / variance[0])
+
+
+def advantage(imu: ImuSamples, rates: TurnRates, offset_s: float, other_s: float) -> float:
+    """Return by how many standard errors the correlation at one offset exceeds that at another.
+
+    The standard error is that of the mean over stretches of the log, each under the offset's best rotation.
+    """
+    rates = _believable(imu, rates)
+    order = np.argsort(rates.start_ns, kind="stable")
+    rates = replace(rates, start_ns=rates.start_ns[order], end_ns=rates.end_ns[order], rates=rates.rates[order])
+    gain = _products(imu, rates, offset_s) - _products(imu, rates, other_s)
+    gain = gain[~np.isnan(gain)]
+    if len(gain) < _LEAST_SAMPLES:
+        return 0.0
+    means = np.array([part.mean() for part in np.array_split(gain, _STRETCHES)])
+    return float(means.mean() / max(means.std(ddof=1) / np.sqrt(_STRETCHES), 1e-12))
+
+
+def _products(imu: ImuSamples, rates: TurnRates, offset_s: float) -> Array:
+    """Return each turn's part (N,) of the correlation; NaN where the gyroscope has none."""
+    cross, scale = _cross_covariances(imu, rates, np.array([offset_s]))
+    rotation = _best_rotation(cross)[1][0]
+    gyroscope = _Turned.of(imu).mean_rate(rates, offset_s)
+    there = ~np.isnan(gyroscope[:, 0])
+    gyroscope = gyroscope - gyroscope[there].mean(axis=0)
+    turned = (rates.rates - rates.rates[there].mean(axis=0)) @ rotation.T
+    return np.asarray(np.sum(gyroscope * turned, axis=1) / scale[0])
 
 
 def _scores(imu: ImuSamples, rates: TurnRates, offsets_s: Array) -> Array:

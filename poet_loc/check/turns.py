@@ -15,6 +15,7 @@ from poet_loc.check.turn_rates import (
     Match,
     PoseSource,
     Reading,
+    advantage,
     correlation_under,
     match_turns,
     pose_sources,
@@ -32,6 +33,7 @@ _MARGIN = 0.25  # by which another hypothesis must fit better ..
 _CLEAN, _CLEAN_MARGIN = 0.97, 0.05  # .. and where it fits as well as this
 _DEGREES = 180.0 / np.pi
 _OFFSET_FLOOR_S, _OFFSET_NOISE_S = 0.005, 0.07
+_OFFSET_CLEAR, _OFFSET_ADVANTAGE = 0.8, 1.5  # below this correlation, by so many standard errors above the expected
 
 
 @dataclass(frozen=True)
@@ -215,7 +217,10 @@ def _offsets(log: Log, compared: list[_Compared]) -> Iterator[Finding]:
         off = each.match.offset_s - expected
         correlation = min(each.match.correlation, 1.0)
         uncertain = _OFFSET_FLOOR_S + _OFFSET_NOISE_S * np.sqrt(1.0 - correlation**2) / correlation
-        late.append((each, off, off if abs(off) > uncertain else 0.0))
+        clear = abs(off) > uncertain and (
+            correlation > _OFFSET_CLEAR or _advantage(log, each, expected) > _OFFSET_ADVANTAGE
+        )
+        late.append((each, off, off if clear else 0.0))
     of_camera = [(each, off) for each, off, wrong in late if each.source.body == "cam" and wrong]
     cameras = [each for each, _, _ in late if each.source.body == "cam"]
     offsets = [each.match.offset_s for each, _ in of_camera]
@@ -228,6 +233,13 @@ def _offsets(log: Log, compared: list[_Compared]) -> Iterator[Finding]:
         if shared and each is not best:
             continue
         yield _offset_finding(each, off, stated, shared and log.calibration is not None)
+
+
+def _advantage(log: Log, each: _Compared, expected_s: float) -> float:
+    """By how many standard errors the source fits better at the offset found than at the expected one."""
+    assert log.imu is not None
+    reading: Reading = "as is" if each.match is each.as_it_is else "inverse"
+    return advantage(log.imu, turn_rates(each.source, reading), each.match.offset_s, expected_s)
 
 
 def _offset_finding(each: _Compared, off: float, stated: float, shared: bool) -> Finding:
