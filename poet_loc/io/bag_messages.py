@@ -73,7 +73,7 @@ def open_bag(path: str | Path, typestore: str | None = None) -> Iterator[Any]:
     try:
         from rosbags.highlevel import AnyReader, AnyReaderError
     except ImportError:
-        raise InputError("reading bags needs rosbags", fix="pip install poet-loc[bags]") from None
+        raise InputError("reading bags needs rosbags", fix="pip install rosbags") from None
     store = None if typestore is None else typestore_with_vision(typestore)
     try:
         reader = AnyReader(_files(path), default_typestore=store)

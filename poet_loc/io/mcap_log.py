@@ -47,7 +47,7 @@ def write_mcap(
     try:
         from rosbags.rosbag2 import StoragePlugin, Writer
     except ImportError:
-        raise InputError("writing MCAP needs rosbags", fix="pip install poet-loc[bags]") from None
+        raise InputError("writing MCAP needs rosbags", fix="pip install rosbags") from None
     store = typestore_with_vision(_STORE)
     topics = list(_topics(store, log, further or {}))
     if not topics:
