@@ -15,11 +15,13 @@ from fusion.compiled import njit
 from fusion.imu import write_gravity_basis
 from fusion.nav_state import (
     AT_BIASES,
+    AT_CLONE,
     AT_EXTRINSICS,
     AT_GRAVITY,
     AT_OBJECTS,
     AT_TIME_OFFSET,
     BIASES,
+    CLONE,
     EXTRINSIC_ROTATION,
     GRAVITY,
     N_BIAS_KINDS,
@@ -33,7 +35,7 @@ from fusion.nav_state import (
     Array,
     Ints,
 )
-from fusion.so3_kernels import exp_so3, log_so3, multiply, multiply_transposed_left, orthonormalise
+from fusion.so3_kernels import apply, exp_so3, log_so3, multiply, multiply_transposed_left, orthonormalise
 
 REJECTED, POSITION_ONLY, ROTATION_ONLY, ACCEPTED = 0, 1, 2, 3  # bit 0: position used, bit 1: rotation used
 
@@ -277,6 +279,44 @@ def inject(x: Array, error: Array, layout: Ints, scratch: Array) -> None:
     if layout[AT_BIASES] >= 0:
         for i in range(6 * layout[N_OBJECTS] * layout[N_BIAS_KINDS]):
             x[layout[BIASES] + i] += error[layout[AT_BIASES] + i]
+    if layout[AT_CLONE] >= 0:
+        start, at = layout[CLONE], layout[AT_CLONE]
+        turn, turned = scratch[0:9], scratch[9:18]
+        exp_so3(error[at], error[at + 1], error[at + 2], turn)
+        multiply(turn, x[start : start + 9], turned)
+        apply(turn, x[start + 9], x[start + 10], x[start + 11], scratch[18:21])
+        orthonormalise(turned, turn)
+        for i in range(9):
+            x[start + i] = turned[i]
+        for i in range(3):
+            x[start + 9 + i] = scratch[18 + i] + error[at + 3 + i]
+
+
+@njit(cache=True)
+def clone_pose(x: Array, P: Array, layout: Ints) -> None:
+    """Let the clone be the pose of now: xi = R theta, rho = dp + p x xi (see `nav_state`), in state and covariance.
+
+    Source: S. Roumeliotis and J. Burdick, "Stochastic cloning", ICRA 2002.
+    """
+    start, at = layout[CLONE], layout[AT_CLONE]
+    for i in range(12):
+        x[start + i] = x[i]
+    for j in range(at):
+        _clone_errors(x, P[:, j], P[at:, j])
+    for j in range(at + 6):
+        _clone_errors(x, P[j], P[j, at:])
+    for i in range(at, at + 6):
+        for j in range(i):
+            P[i, j] = P[j, i] = 0.5 * (P[i, j] + P[j, i])
+
+
+@njit(cache=True)
+def _clone_errors(x: Array, pose: Array, clone: Array) -> None:
+    px, py, pz = x[POSITION], x[POSITION + 1], x[POSITION + 2]
+    a, b, c = pose[0], pose[1], pose[2]
+    u, v, w = x[0] * a + x[1] * b + x[2] * c, x[3] * a + x[4] * b + x[5] * c, x[6] * a + x[7] * b + x[8] * c
+    clone[0], clone[1], clone[2] = u, v, w
+    clone[3], clone[4], clone[5] = pose[3] + py * w - pz * v, pose[4] + pz * u - px * w, pose[5] + px * v - py * u
 
 
 @njit(cache=True)

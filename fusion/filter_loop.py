@@ -30,6 +30,7 @@ from fusion.eskf import (
     ROTATION_ONLY,
     adopt_object,
     bias_sigma,
+    clone_pose,
     correct,
     decay_biases,
     fit_symmetry,
@@ -38,9 +39,10 @@ from fusion.eskf import (
     innovation,
 )
 from fusion.imu import propagate_covariance, propagate_nominal, transition_blocks, write_gravity_basis
-from fusion.measurements import OBJECT_POSE, camera_in_world, residual_and_jacobian
+from fusion.measurements import OBJECT_POSE, ODOMETRY_STEP, camera_in_world, residual_and_jacobian
 from fusion.memory import (
     BIAS_TIME,
+    CLONED,
     IMU_AT,
     INITIALISING,
     LAST_UPDATE,
@@ -87,6 +89,7 @@ from fusion.so3_kernels import (
     multiply_transposed_right,
 )
 from fusion.tape import (
+    note_clone,
     note_correction,
     note_decay,
     note_forgetting,
@@ -214,11 +217,25 @@ def measure(
 ) -> None:
     """Take in the measurements first..last-1, all at the filter's stamp; write decisions (M,) and nis (M, 3)."""
     c = m.counters
+    odometry = first
+    while first < last and kinds[first] == ODOMETRY_STEP:
+        first += 1
+    if odometry < first == last and c[MODE] != TRACKING:
+        return
     if c[MODE] == TRACKING:
         if len(m.tape) > 0:
             note_decay(m, (c[NOW] - c[BIAS_TIME]) * 1e-9)
         decay_biases(m.x, m.P, (c[NOW] - c[BIAS_TIME]) * 1e-9, m.bias_model, m.layout)
         c[BIAS_TIME] = c[NOW]
+    for j in range(odometry, first):
+        decisions[j] = REJECTED
+        if c[MODE] == TRACKING and c[CLONED] == 1:
+            decisions[j] = _update(
+                m, w, kinds[j], -1, rotations[j], translations[j], covariances[j], rate, nis[j], True
+            )
+    if odometry < first == last:
+        _clone(m)
+        return
     accepted = False
     for j in range(first, last):
         decisions[j] = PENDING if c[MODE] == TRACKING else REJECTED
@@ -238,6 +255,17 @@ def measure(
         _try_to_start(m, w)
     else:
         _restart_if_lost(m, w)
+    if odometry < first and c[MODE] == TRACKING:
+        _clone(m)
+
+
+@njit(cache=True)
+def _clone(m: Memory) -> None:
+    """Keep the pose of now as what the next odometry is measured against."""
+    clone_pose(m.x, m.P, m.layout)
+    m.counters[CLONED] = 1
+    if len(m.tape) > 0:
+        note_clone(m)
 
 
 @njit(cache=True)
@@ -576,7 +604,7 @@ def _adopt(m: Memory, w: Work, keep_from: int) -> None:
         kind, component = i // (6 * m.layout[N_OBJECTS]), i % 6
         m.x[m.layout[BIASES] + i] = 0.0
         m.P[at + i, at + i] = bias_sigma(m.bias_model, kind, component) ** 2
-    m.counters[BIAS_TIME] = m.counters[NOW]
+    m.counters[BIAS_TIME], m.counters[CLONED] = m.counters[NOW], 0
     forget_places(m)
     # The agreeing votes count as used, so that a restart is not followed by the next at once.
     for a in range(len(m.inliers)):

@@ -15,7 +15,7 @@ from fusion import filter_loop, memory
 from fusion.calibrated import calibrated
 from fusion.eskf import POSITION_ONLY, ROTATION_ONLY
 from fusion.health import run_health
-from fusion.measurements import Measurements
+from fusion.measurements import ODOMETRY_STEP, Measurements
 from fusion.options import FuseOptions
 from fusion.place_watch import RELEASED
 from fusion.prepare import Problem, fill_memory, pose_problem
@@ -166,11 +166,13 @@ def result_from_rows(
 
 
 def gate_log(problem: Problem, decisions: NDArray[np.int64], nis: Array) -> GateLog:
-    """Say of every measurement what was used; nis (M, 3) is [both, rotation, position]."""
+    """Say of every pose that was measured what was used; nis (M, 3) is [both, rotation, position]."""
     measured: Measurements = problem.measurements
-    keys = np.array([*problem.keys, (-1, 0)], dtype=np.int64)[measured.objects]
+    poses = measured.kinds != ODOMETRY_STEP
+    decisions, nis = decisions[poses], nis[poses]
+    keys = np.array([*problem.keys, (-1, 0)], dtype=np.int64)[measured.objects[poses]]
     return GateLog(
-        measured.stamps_ns,
+        measured.stamps_ns[poses],
         keys[:, 0],
         keys[:, 1],
         nis[:, 0],

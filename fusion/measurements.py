@@ -6,6 +6,8 @@ One vocabulary for filter and graph. A measurement is a row of `Measurements`; i
                  R_cam_obj = R_ic^T R_wi^T R_wo,  p_cam_obj = R_ic^T (R_wi^T (p_wo - p_wi) - p_ic)
     camera pose  R_measured = R_world_cam Exp(e_r), t_measured = p_world_cam + e_t
                  R_world_cam = R_wi R_ic,  p_world_cam = p_wi + R_wi p_ic
+    odometry     R_measured = R_then_cam Exp(e_r), t_measured = p_then_cam + e_t, of the camera now in that of the last
+                 odometry, which the state keeps as a clone of the imu's pose
 
 with white errors e and, for objects, slowly varying biases b, all in camera axes. A pose network errs in depth and in
 where it sees the object, so b_t = (x, y, depth) shifts the image by x and y (rad) and stretches the distance:
@@ -18,7 +20,7 @@ rotation rows across it.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,10 +28,12 @@ from numpy.typing import NDArray
 from fusion.compiled import njit
 from fusion.nav_state import (
     AT_BIASES,
+    AT_CLONE,
     AT_EXTRINSICS,
     AT_OBJECTS,
     AT_TIME_OFFSET,
     BIASES,
+    CLONE,
     EXTRINSIC_POSITION,
     EXTRINSIC_ROTATION,
     N_BIAS_KINDS,
@@ -57,7 +61,7 @@ from fusion.so3_kernels import (
 )
 
 Array = NDArray[np.float64]
-CAMERA_POSE, OBJECT_POSE = 0, 1
+CAMERA_POSE, OBJECT_POSE, ODOMETRY_STEP = 0, 1, 2
 MAX_COLUMNS = 34  # attitude 3, position 3, extrinsics 6, object 6, two biases 12, velocity 3, time offset 1
 
 
@@ -68,11 +72,11 @@ class Measurements:
     stamps_ns: NDArray[np.int64]
     """(M,) on the IMU's clock, with the calibration's time shift already added."""
     kinds: NDArray[np.int64]
-    """(M,) CAMERA_POSE or OBJECT_POSE."""
+    """(M,) CAMERA_POSE, OBJECT_POSE or ODOMETRY_STEP; of one stamp, odometry comes first."""
     objects: NDArray[np.int64]
-    """(M,) index of the landmark, -1 for a camera pose."""
+    """(M,) index of the landmark, -1 for the others."""
     rotations: Array
-    """(M, 9) row-major: R_cam_obj or R_world_cam."""
+    """(M, 9) row-major: R_cam_obj, R_world_cam or R_then_cam."""
     translations: Array
     """(M, 3) m."""
     covariances: Array
@@ -80,6 +84,13 @@ class Measurements:
 
     def __len__(self) -> int:
         return len(self.stamps_ns)
+
+    @classmethod
+    def merged(cls, first: Measurements, second: Measurements) -> Measurements:
+        """Return two sets in order of time; of one stamp, those of the first set come first."""
+        order = np.argsort(np.r_[first.stamps_ns, second.stamps_ns], kind="stable")
+        names = [each.name for each in fields(cls)]
+        return cls(*(np.concatenate([getattr(first, name), getattr(second, name)])[order] for name in names))
 
 
 def viewing_axes(translations: Array) -> Array:
@@ -159,6 +170,9 @@ def residual_and_jacobian(
     count = _columns(count, POSITION_ERROR, 3, columns)
     if layout[AT_EXTRINSICS] >= 0:
         count = _columns(count, layout[AT_EXTRINSICS], 6, columns)
+    if kind == ODOMETRY_STEP:  # both its ends move with the time offset
+        _odometry_step(x, R_m, t_m, layout, count, residual, H, work)
+        return _columns(count, layout[AT_CLONE], 6, columns)
     if kind == CAMERA_POSE:
         _camera_pose(x, R_m, t_m, R_wi, R_wc, p_wi, layout, residual, H, work[30:])
     else:
@@ -231,6 +245,52 @@ def _camera_pose(
     if layout[AT_EXTRINSICS] >= 0:
         _put(H, 0, 6, 1.0, inverse)
         _put(H, 3, 9, 1.0, R_wi)
+
+
+@njit(cache=True)
+def _odometry_step(
+    x: Array, R_m: Array, t_m: Array, layout: Ints, at_clone: int, residual: Array, H: Array, work: Array
+) -> None:
+    """Write residual and Jacobian of the camera's motion since the clone; C = R_world_cam then, s = p_world_cam now."""
+    start = layout[CLONE]
+    R_ic, p_ic = x[EXTRINSIC_ROTATION : EXTRINSIC_ROTATION + 9], x[EXTRINSIC_POSITION : EXTRINSIC_POSITION + 3]
+    C, R_wc, R_tc, block = work[0:9], work[9:18], work[18:27], work[27:36]
+    inverse, s, then, t = work[36:45], work[45:48], work[48:51], work[51:54]
+    multiply(x[start : start + 9], R_ic, C)
+    multiply(x[0:9], R_ic, R_wc)
+    multiply_transposed_left(C, R_wc, R_tc)
+    apply(x[0:9], p_ic[0], p_ic[1], p_ic[2], s)
+    apply(x[start : start + 9], p_ic[0], p_ic[1], p_ic[2], then)
+    for i in range(3):
+        s[i] += x[POSITION + i]
+        then[i] += x[start + 9 + i]
+    apply_transposed(C, s[0] - then[0], s[1] - then[1], s[2] - then[2], t)
+    multiply_transposed_left(R_tc, R_m, block)
+    log_so3(block, residual)
+    for i in range(3):
+        residual[3 + i] = t_m[i] - t[i]
+    left_jacobian_inverse(residual[0], residual[1], residual[2], 1.0, inverse)
+    multiply_transposed_right(inverse, R_ic, block)
+    _put(H, 0, 0, 1.0, block)
+    multiply_transposed_right(inverse, R_wc, block)
+    _put(H, 0, at_clone, -1.0, block)
+    _transposed_times_skew(C, s, block)
+    _put(H, 3, at_clone, 1.0, block)
+    for i in range(3):
+        for j in range(3):
+            H[3 + i, 3 + j] = C[3 * j + i]
+            H[3 + i, at_clone + 3 + j] = -C[3 * j + i]
+    multiply_transposed_left(C, x[0:9], R_wc)
+    times_skew(R_wc, p_ic[0], p_ic[1], p_ic[2], block)
+    _put(H, 3, 0, -1.0, block)
+    if layout[AT_EXTRINSICS] >= 0:
+        multiply_transposed_right(inverse, R_tc, block)
+        for i in range(3):
+            for j in range(3):
+                H[i, 6 + j] = inverse[3 * i + j] - block[3 * i + j]
+                H[3 + i, 9 + j] = R_wc[3 * i + j] - R_ic[3 * j + i]
+        H[3, 7], H[3, 8], H[4, 6] = -t[2], t[1], t[2]
+        H[4, 8], H[5, 6], H[5, 7] = -t[0], -t[1], t[0]
 
 
 @njit(cache=True)

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from fusion.compiled import njit
 from fusion.consensus import VOTE_SIZE
 from fusion.measurements import MAX_COLUMNS
-from fusion.nav_state import CORE, StateLayout
+from fusion.nav_state import CORE, LAYOUT_SIZE, StateLayout
 
 Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -31,8 +31,9 @@ VOTES = 256  # a second of eight objects at 30 Hz
     UP_COUNT,
     TAPE_END,
     REFUSED_ROW,
+    CLONED,  # 1 where the clone is that of the last odometry
     N_COUNTERS,
-) = range(12)
+) = range(13)
 INITIALISING, TRACKING = 0, 1
 
 TALLY_SIZE, PLACE_SIZE = 8, 15  # rows of tallies and places, see place_watch.py
@@ -133,7 +134,7 @@ def allocate(layout: StateLayout) -> tuple[Array, Ints]:
     floats = np.zeros(at)
     whole = HEADER
     counts: Sequence[tuple[int, int]] = (
-        (AT_LAYOUT, 10),
+        (AT_LAYOUT, LAYOUT_SIZE),
         (AT_COUNTERS, N_COUNTERS),
         (AT_ORDERS, max(K, 1)),
         (AT_COLUMNS, MAX_COLUMNS),
@@ -145,7 +146,7 @@ def allocate(layout: StateLayout) -> tuple[Array, Ints]:
         whole += size
     integers = np.zeros(whole, dtype=np.int64)
     integers[:HEADER] = header
-    integers[header[AT_LAYOUT] : header[AT_LAYOUT] + 10] = layout.as_integers()
+    integers[header[AT_LAYOUT] : header[AT_LAYOUT] + LAYOUT_SIZE] = layout.as_integers()
     integers[header[AT_ORDERS] : header[AT_ORDERS] + max(K, 1)] = 1
     return floats, integers
 
@@ -200,7 +201,7 @@ def views(floats: Array, integers: Ints) -> Memory:
         f[i[AT_WORK] : i[AT_WORK] + work_size(n)],
         f[i[AT_VOTES] : i[AT_VOTES] + VOTES * VOTE_SIZE].reshape((VOTES, VOTE_SIZE)),
         f[i[AT_TAPE] : i[AT_TAPE] + i[TAPE_SIZE]],
-        i[i[AT_LAYOUT] : i[AT_LAYOUT] + 10],
+        i[i[AT_LAYOUT] : i[AT_LAYOUT] + LAYOUT_SIZE],
         i[i[AT_COUNTERS] : i[AT_COUNTERS] + N_COUNTERS],
         i[i[AT_ORDERS] : i[AT_ORDERS] + K],
         i[i[AT_COLUMNS] : i[AT_COLUMNS] + MAX_COLUMNS],

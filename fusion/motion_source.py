@@ -1,21 +1,23 @@
-"""What carries the state between measurements: the IMU, odometry, or nothing but a smooth motion."""
+"""What carries the state between measurements: the IMU, odometry, both, or nothing but a smooth motion."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import RigidTransform
 
+from fusion.measurements import ODOMETRY_STEP, Measurements
 from fusion.odometry import odometry_samples
 from fusion.options import FuseOptions
 from poet_loc.core.input_error import InputError
 from poet_loc.core.records import Calibration, ImuNoise, ImuSamples
+from poet_loc.core.trajectory import Trajectory
 from poet_loc.io.log_folder import Log
 
-Kind = Literal["imu", "odometry", "constant-velocity"]
+Kind = Literal["imu", "odometry", "imu+odometry", "constant-velocity"]
 
 
 @dataclass(frozen=True)
@@ -41,16 +43,47 @@ def motion_source(
     kind = options.motion
     if kind == "auto":
         kind = "imu" if log.imu is not None else "odometry" if log.T_odom_cam is not None else "constant-velocity"
+    if kind == "imu+odometry":
+        _odometry_of(log)
+        return replace(_imu(log, calibration, options), kind=kind)
     if kind == "imu":
         return _imu(log, calibration, options)
     body: Literal["imu", "cam"] = "cam" if calibration.T_cam_imu is None else "imu"
     if kind == "odometry":
-        if log.T_odom_cam is None or len(log.T_odom_cam) < 2:
-            raise InputError("the log has no T_odom_cam.tum", path=log.path, fix="choose another --motion")
+        T_odom_cam = _odometry_of(log)
         T_cam_body = RigidTransform.identity() if calibration.T_cam_imu is None else calibration.T_cam_imu
-        samples = odometry_samples(log.T_odom_cam, T_cam_body)
+        samples = odometry_samples(T_odom_cam, T_cam_body)
         return MotionSource("odometry", samples, ImuNoise(0.0, 0.0, 0.0, 0.0, 0.0), body)
     return MotionSource("constant-velocity", _nothing_measured(stamps_ns, options), _smooth(options), body)
+
+
+def odometry_steps(log: Log, calibration: Calibration, options: FuseOptions) -> Measurements:
+    """Return the camera's motion from each odometry pose to one at least `odometry.step_s` later, as measurements.
+
+    The first has nothing to be measured against and only says where the second begins.
+    """
+    T_odom_cam, walk = _odometry_of(log), options.odometry
+    seconds, kept = (T_odom_cam.stamps_ns - T_odom_cam.stamps_ns[0]) * 1e-9, [0]
+    for k, at in enumerate(seconds):
+        if at - seconds[kept[-1]] >= walk.step_s - 1e-6:
+            kept.append(k)
+    poses, count = T_odom_cam.T_world_body[kept], len(kept)
+    moved = RigidTransform.concatenate([RigidTransform.identity(), poses[:-1].inv() * poses[1:]])
+    sigma = np.repeat([np.radians(walk.rotation_walk_deg), walk.translation_walk], 3)
+    return Measurements(
+        T_odom_cam.stamps_ns[kept] + round(calibration.timeshift_cam_imu_s * 1e9),
+        np.full(count, ODOMETRY_STEP, dtype=np.int64),
+        np.full(count, -1, dtype=np.int64),
+        moved.rotation.as_matrix().reshape(-1, 9),
+        np.ascontiguousarray(moved.translation),
+        np.diff(seconds[kept], prepend=-1.0)[:, None, None] * np.diag(sigma**2),
+    )
+
+
+def _odometry_of(log: Log) -> Trajectory:
+    if log.T_odom_cam is None or len(log.T_odom_cam) < 2:
+        raise InputError("the log has no T_odom_cam.tum", path=log.path, fix="choose another --motion")
+    return log.T_odom_cam
 
 
 def _imu(log: Log, calibration: Calibration, options: FuseOptions) -> MotionSource:

@@ -3,12 +3,15 @@
 The nominal state is one flat float64 array, so that compiled loops, snapshots and the plain reference share it:
 
     core       R_world_imu (9, row-major), p_world_imu (3), v_world_imu (3), gyroscope bias (3), accelerometer bias (3)
-    beside it  T_imu_cam (9 + 3), time offset (1), gravity in world axes (3), T_world_obj (12) and bias (6) per object
+    beside it  T_imu_cam (9 + 3), time offset (1), gravity in world axes (3), T_world_obj (12) and bias (6) per object,
+               and the clone (12): T_world_imu at the last odometry
 
 The error state holds the core's 15 components always, then what is switched on:
 [attitude, position, velocity, gyroscope bias, accelerometer bias | extrinsics 6 | time offset 1 | gravity 2 |
- objects 6 each | biases 6 each].
-Rotation errors are on the right (R_true = R Exp(theta)), everything else is additive in the axes it is stored in.
+ objects 6 each | biases 6 each | clone 6].
+Rotation errors are on the right (R_true = R Exp(theta)), everything else is additive in the axes it is stored in; but
+the clone's error, of the imu's pose at the last odometry, is in world axes about the world's origin
+(R_true = Exp(xi) R, p_true = Exp(xi) p + rho), so that a correction of the attitude leaves its meaning as it is.
 """
 
 from __future__ import annotations
@@ -19,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from poet_loc.core.geometry import pose_from_quaternion
+from poet_loc.core.geometry import make_pose, pose_from_quaternion
 
 Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -45,7 +48,10 @@ CORE = 15
     N_BIAS_KINDS,
     AT_BIASES,
     BIASES,
-) = range(10)
+    AT_CLONE,
+    CLONE,
+    LAYOUT_SIZE,
+) = range(13)
 
 
 @dataclass(frozen=True)
@@ -59,6 +65,8 @@ class StateLayout:
     objects: bool = False
     bias_kinds: int = 0
     """Bias states per object: 0 none, 1 slowly varying, 2 a constant one beside it."""
+    clone: bool = False
+    """The pose at the last odometry, which odometry beside an IMU measures against."""
 
     def _starts(self) -> dict[str, int]:
         starts, at = {}, CORE
@@ -68,6 +76,7 @@ class StateLayout:
             "gravity": 2 * self.gravity,
             "objects": 6 * self.n_objects * self.objects,
             "biases": 6 * self.n_objects * self.bias_kinds,
+            "clone": 6 * self.clone,
         }
         for name, size in sizes.items():
             starts[name] = at if size else -1
@@ -82,6 +91,11 @@ class StateLayout:
     @property
     def n_nominal(self) -> int:
         """Size of the nominal array."""
+        return self.clone_start + 12 * self.clone
+
+    @property
+    def clone_start(self) -> int:
+        """Where the clone starts in the nominal array."""
         return self.bias_start + 6 * self.n_objects * self.bias_kinds
 
     @property
@@ -92,7 +106,7 @@ class StateLayout:
     def error_slice(self, name: str, index: int = 0, kind: int = 0) -> slice:
         """Return where an optional part stands in the error state.
 
-        name: extrinsics, time_offset, gravity, objects or biases; index: which object; kind: which bias.
+        name: extrinsics, time_offset, gravity, objects, biases or clone; index: which object; kind: which bias.
         Raises KeyError for a part that is switched off.
         """
         start = self._starts()[name]
@@ -121,6 +135,8 @@ class StateLayout:
                 self.bias_kinds,
                 starts["biases"],
                 self.bias_start,
+                starts["clone"],
+                self.clone_start,
             ],
             dtype=np.int64,
         )
@@ -154,6 +170,8 @@ def nominal_state(
     x[GRAVITY : GRAVITY + 3] = (0.0, 0.0, -gravity)
     for k in range(layout.n_objects if T_world_obj is not None else 0):
         put_pose(x, OBJECTS + OBJECT_SIZE * k, T_world_obj[k])  # type: ignore[index]
+    if layout.clone:
+        put_pose(x, layout.clone_start, identity)
     return x
 
 
@@ -199,6 +217,9 @@ def retract_state(x: Array, error: Array, layout: StateLayout) -> Array:
             moved[OBJECTS + OBJECT_SIZE * k + 9 : OBJECTS + OBJECT_SIZE * (k + 1)] += part[3:]
         for kind in range(layout.bias_kinds):
             moved[layout.nominal_bias(k, kind)] += error[layout.error_slice("biases", k, kind)]
+    if layout.clone:
+        xi, rho = np.split(error[layout.error_slice("clone")], 2)
+        put_pose(moved, layout.clone_start, make_pose(Rotation.from_rotvec(xi), rho) * pose_at(x, layout.clone_start))
     return moved
 
 
@@ -229,4 +250,7 @@ def local_state(x_from: Array, x_to: Array, layout: StateLayout) -> Array:
             error[layout.error_slice("objects", k)] = np.r_[turn(start), shift]
         for kind in range(layout.bias_kinds):
             error[layout.error_slice("biases", k, kind)] = (x_to - x_from)[layout.nominal_bias(k, kind)]
+    if layout.clone:
+        moved = pose_at(x_to, layout.clone_start) * pose_at(x_from, layout.clone_start).inv()
+        error[layout.error_slice("clone")] = np.r_[moved.rotation.as_rotvec(), moved.translation]
     return error

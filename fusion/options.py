@@ -204,12 +204,14 @@ class Estimate:
 
 @dataclass(frozen=True)
 class Odometry:
-    """How odometry drifts, where it is the source of motion: measured on visual odometry (ORB-SLAM3) of YCB-V."""
+    """How odometry drifts, in place of an IMU or beside it: measured on visual odometry (ORB-SLAM3) of YCB-V."""
 
     rotation_walk_deg: float = 0.25
     """deg per square root of a second, per axis."""
     translation_walk: float = 0.005
     """m per square root of a second, per axis."""
+    step_s: float = 0.3
+    """Beside an IMU: each relative pose reaches back so far at least, s."""
 
 
 @dataclass(frozen=True)
@@ -284,8 +286,11 @@ class FuseOptions:
     """eskf: let every state know the whole log; not causal, and named fuse/eskf-smoothed."""
     measurements: Literal["camera", "objects"] = "objects"
     """camera: the solver's (or the log's own) camera poses; objects: each object's pose directly."""
-    motion: Literal["auto", "imu", "odometry", "constant-velocity"] = "auto"
-    """What carries the state between measurements; auto: the IMU, else the odometry, else constant velocity."""
+    motion: Literal["auto", "imu", "odometry", "imu+odometry", "constant-velocity"] = "auto"
+    """What carries the state between measurements; auto: the IMU, else the odometry, else constant velocity.
+
+    imu+odometry (eskf): the IMU carries it, and the odometry's relative poses are measurements against a cloned pose.
+    """
     noise: DetectionNoise = field(default_factory=DetectionNoise)
     camera_noise: CameraNoise = field(default_factory=CameraNoise)
     bias: DetectionBias = field(default_factory=DetectionBias)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
 
@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from fusion import consensus, eskf, filter_loop, imu, memory, odometry, place_watch
 from fusion.measurements import CAMERA_POSE, OBJECT_POSE, Measurements, ray_aligned_covariance
-from fusion.motion_source import Kind, motion_source
+from fusion.motion_source import Kind, motion_source, odometry_steps
 from fusion.nav_state import ACCEL_BIAS_ERROR, CORE, GYRO_BIAS_ERROR, VELOCITY_ERROR, StateLayout, nominal_state
 from fusion.options import DetectionBias, FuseOptions
 from poet_loc.core.consistency import chi_square_quantile
@@ -22,6 +22,7 @@ from poet_loc.io.log_folder import Log
 
 Array = NDArray[np.float64]
 
+WITH_IMU: tuple[Kind, ...] = ("imu", "imu+odometry")
 NEAREST_OBJECT = 1e-3  # m
 STANDARD_GRAVITY = 9.81  # m/s^2
 VELOCITY_OF_ODOMETRY = 0.05  # m/s, reported beside the velocity that odometry gives
@@ -69,7 +70,12 @@ def pose_problem(
         detections = object_poses if object_poses is not None else log.detections(None)[1]
         measured = object_measurements(detections, log.landmark_map, calibration, options)
     source = motion_source(log, calibration, options, measured.stamps_ns)
-    if source.kind != "imu" and options.estimate.gravity:
+    if source.kind == "imu+odometry":
+        if options.estimator != "eskf":
+            raise InputError("the graph moves by the IMU or by odometry, not by both", fix="choose another --motion")
+        layout = replace(layout, clone=True)
+        measured = Measurements.merged(odometry_steps(log, calibration, options), measured)
+    if source.kind not in WITH_IMU and options.estimate.gravity:
         raise InputError(f"{source.kind} feels no gravity", fix="do not estimate its direction")
     motion = (source.samples, source.noise, calibration, measured, layout, log.landmark_map, source.kind, source.body)
     return Problem(log.path, *motion)
@@ -177,7 +183,7 @@ def fill_memory(problem: Problem, options: FuseOptions) -> tuple[Array, NDArray[
     m = memory.views.py_func(floats, integers)
     T_imu_cam = None if calibration.T_cam_imu is None else calibration.T_cam_imu.inv()
     T_world_obj = landmark_map.T_world_obj if layout.n_objects and landmark_map is not None else None
-    gravity = STANDARD_GRAVITY if problem.motion == "imu" else 0.0
+    gravity = STANDARD_GRAVITY if problem.motion in WITH_IMU else 0.0
     m.x[:] = nominal_state(layout, T_imu_cam=T_imu_cam, T_world_obj=T_world_obj, gravity=gravity)
     m.noise[[imu.GYRO_NOISE, imu.ACCEL_NOISE, imu.GYRO_WALK, imu.ACCEL_WALK]] = (
         imu_noise.gyroscope_noise_density,
@@ -223,7 +229,7 @@ def fill_memory(problem: Problem, options: FuseOptions) -> tuple[Array, NDArray[
 
 def _without_imu(problem: Problem, options: FuseOptions, m: memory.Memory) -> None:
     """Change what an IMU has and another source of motion has not."""
-    if problem.motion == "imu":
+    if problem.motion in WITH_IMU:
         return
     m.start[consensus.MAX_TILT] = math.pi
     m.noise[imu.GAP_S] = math.inf
@@ -253,7 +259,7 @@ def _anchor(problem: Problem) -> int:
     Raises InputError where there is none.
     """
     landmarks = [] if problem.landmark_map is None else list(problem.landmark_map)
-    for k in problem.measurements.objects:
+    for k in problem.measurements.objects[problem.measurements.kinds == OBJECT_POSE]:
         if landmarks[k].symmetry is None:
             return int(k)
     raise InputError("no object without symmetry is seen, so none can anchor the world", path=problem.path)

@@ -27,7 +27,7 @@ from fusion.eskf import (
     forget_bias,
 )
 from fusion.fuse import run_filter
-from fusion.measurements import OBJECT_POSE
+from fusion.measurements import OBJECT_POSE, ODOMETRY_STEP
 from fusion.nav_state import (
     EXTRINSIC_ROTATION,
     GYRO_BIAS,
@@ -51,6 +51,7 @@ from fusion.reference_models import (
     POS,
     POSITION_ROWS,
     ROTATION_ROWS,
+    cloning,
     exp,
     layout_from_integers,
     nearest_symmetric,
@@ -207,6 +208,13 @@ class ReferenceFilter:
         m.x[:] = retract_state(before, error, self.layout)
         self.spread(transport(before, m.x, error, self.layout), np.zeros_like(m.P))
 
+    def clone(self) -> None:
+        """Let the clone be the pose of now."""
+        m, start = self.m, self.layout.clone_start
+        self.spread(cloning(m.x, self.layout), np.zeros_like(m.P))
+        m.x[start : start + 12] = m.x[:12]
+        m.counters[memory.CLONED] = 1
+
     def _meet_object(self, k: int, R_m: Array, t_m: Array, R: Array, rate: Array) -> int:
         """Place an object whose pose in the world is unknown where its first detection sees it.
 
@@ -257,10 +265,18 @@ class ReferenceFilter:
 
     def measure(self, first: int, last: int, measured: Columns, rate: Array, decisions: Ints, nis: Array) -> None:
         """Take in all measurements of one stamp, then see whether to start or to start again."""
-        m = self.m
+        m, kinds, c = self.m, measured[0], self.m.counters
         decisions[first:last] = REJECTED
+        first, odometry = first + int(np.count_nonzero(kinds[first:last] == ODOMETRY_STEP)), first
         if self.tracking:
             self.decay_biases()
+            for j in range(odometry, first if c[memory.CLONED] else odometry):
+                decisions[j] = self.take(measured, j, rate, nis[j])
+        if odometry < first == last:
+            if self.tracking:
+                self.clone()
+            return
+        if self.tracking:
             for j in self.order(first, last, measured, rate, nis):
                 decisions[j] = self.take(measured, j, rate, nis[j])
             for j in range(first, last if (decisions[first:last] & ACCEPTED).any() else first):
@@ -271,6 +287,8 @@ class ReferenceFilter:
             filter_loop._restart_if_lost(m, self.work)
         else:
             filter_loop._try_to_start(m, self.work)
+        if odometry < first and self.tracking:
+            self.clone()
 
 
 def run_log(

@@ -11,9 +11,10 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from fusion import imu
-from fusion.measurements import CAMERA_POSE
+from fusion.measurements import CAMERA_POSE, ODOMETRY_STEP
 from fusion.nav_state import (
     ACCEL_BIAS,
+    AT_CLONE,
     AT_EXTRINSICS,
     AT_GRAVITY,
     AT_OBJECTS,
@@ -67,6 +68,7 @@ def layout_from_integers(layout: Ints) -> StateLayout:
         gravity=bool(on[AT_GRAVITY]),
         objects=bool(on[AT_OBJECTS]),
         bias_kinds=int(layout[N_BIAS_KINDS]),
+        clone=bool(on[AT_CLONE]),
     )
 
 
@@ -148,6 +150,44 @@ def camera_pose_residual(x: Array, R_m: Array, t_m: Array, layout: StateLayout) 
     return residual, H
 
 
+def odometry_residual(x: Array, R_m: Array, t_m: Array, layout: StateLayout) -> tuple[Array, Array]:
+    """Return residual (6,) and dense H (6, n) of the camera's measured motion since the clone.
+
+    With C, q the camera then and R_wc, s the camera now: R_m = C^T R_wc Exp(e_r), t_m = C^T (s - q) + e_t.
+    """
+    R_wi, p_wi, R_ic, p_ic = _imu_and_camera(x)
+    then = x[layout.clone_start : layout.clone_start + 12]
+    C, q = then[:9].reshape(3, 3) @ R_ic, then[9:] + then[:9].reshape(3, 3) @ p_ic
+    R_wc, s = R_wi @ R_ic, p_wi + R_wi @ p_ic
+    residual = np.r_[log((C.T @ R_wc).T @ R_m), t_m - C.T @ (s - q)]
+    inverse = so3_left_jacobian_inverse(residual[:3])
+    H = np.zeros((6, layout.n_error))
+    H[ROTATION_ROWS, ATT] = inverse @ R_ic.T
+    H[POSITION_ROWS, ATT] = -C.T @ R_wi @ skew(p_ic)
+    H[POSITION_ROWS, POS] = C.T
+    at = layout.error_slice("clone").start
+    H[ROTATION_ROWS, at : at + 3] = -inverse @ R_wc.T
+    H[POSITION_ROWS, at : at + 3] = C.T @ skew(s)
+    H[POSITION_ROWS, at + 3 : at + 6] = -C.T
+    if layout.extrinsics:
+        at = layout.error_slice("extrinsics").start
+        H[ROTATION_ROWS, at : at + 3] = inverse @ (np.eye(3) - R_wc.T @ C)
+        H[POSITION_ROWS, at : at + 3] = skew(C.T @ (s - q))
+        H[POSITION_ROWS, at + 3 : at + 6] = C.T @ R_wi - R_ic.T
+    return residual, H
+
+
+def cloning(x: Array, layout: StateLayout) -> Array:
+    """Return the dense map (n, n) that makes the clone's error of the pose's: xi = R theta, rho = dp + p x xi."""
+    R, rows = x[:9].reshape(3, 3), layout.error_slice("clone")
+    A = np.eye(layout.n_error)
+    A[rows] = 0.0
+    A[rows.start : rows.start + 3, ATT] = R
+    A[rows.start + 3 : rows.stop, ATT] = skew(x[POSITION : POSITION + 3]) @ R
+    A[rows.start + 3 : rows.stop, POS] = np.eye(3)
+    return A
+
+
 def object_pose_residual(x: Array, k: int, R_m: Array, t_m: Array, layout: StateLayout) -> tuple[Array, Array]:
     """Return residual (6,) and dense H (6, n) of a measured T_cam_obj of object k.
 
@@ -194,6 +234,8 @@ def residual_and_jacobian(
 
     Where the time offset is not the one that the stamp carries, the state moves on at constant velocity and rate.
     """
+    if kind == ODOMETRY_STEP:
+        return odometry_residual(x, R_m, t_m, layout)
     seconds = x[TIME_OFFSET] - nominal_offset
     R_turn, v = exp(seconds * rate), x[VELOCITY : VELOCITY + 3]
     then = x.copy()

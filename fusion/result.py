@@ -63,7 +63,7 @@ class FuseResult:
     """(N, 6, 6) of [e_r, e_t] with R_true = R Exp(e_r), t_true = t + e_t; rad^2, m^2."""
     gate: GateLog
     runtime_s: float
-    motion: Literal["imu", "odometry", "constant-velocity"] = "imu"
+    motion: Literal["imu", "odometry", "imu+odometry", "constant-velocity"] = "imu"
     """What carried the state between measurements."""
     body: Literal["imu", "cam"] = "imu"
     """Whose trajectory T_world_imu is: the camera's where the log says nothing of an IMU."""

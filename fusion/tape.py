@@ -10,6 +10,7 @@ length and its kind; numbers of any type are stored as floats.
     MEETING     the object's first error state, columns, their numbers, the derivative of its pose by them (6 rows)
     FORGETTING  first error state, how many
     RESTART     which error states (n) survive
+    CLONING     R_world_imu (9), [p]x R_world_imu (9): the clone's error made of the pose's
     ROW         number, x (core), the core's rows of P
 """
 
@@ -38,7 +39,7 @@ from fusion.nav_state import (
 )
 from fusion.so3_kernels import multiply_transposed_left
 
-STEP, ODOMETRY, DECAY, CORRECTION, MEETING, FORGETTING, RESTART, ROW = range(8)
+STEP, ODOMETRY, DECAY, CORRECTION, MEETING, FORGETTING, RESTART, ROW, CLONING = range(9)
 STEP_SIZE, TAIL = 54, 2
 
 
@@ -56,7 +57,7 @@ def tape_bound(layout: Ints, samples: int, stamps: int, measurements: int) -> in
     steps, row = (samples + stamps) * (STEP_SIZE + TAIL), 1 + CORE + 6 + CORE * n + TAIL
     correction = 1 + 9 * (3 + K) + 2 + MAX_COLUMNS + 6 * MAX_COLUMNS + 6 + 6 * n + TAIL
     meeting_and_forgetting = 2 + MAX_COLUMNS + 6 * MAX_COLUMNS + TAIL + 8 * (2 + TAIL)
-    per_stamp = biases + TAIL + n + TAIL
+    per_stamp = biases + TAIL + n + TAIL + 18 + TAIL
     return steps + (samples + stamps) * row + stamps * per_stamp + measurements * (correction + meeting_and_forgetting)
 
 
@@ -184,6 +185,20 @@ def note_restart(m: Memory, keep_from: int) -> None:
         is_bias = first >= 0 and first <= i < first + biases
         m.tape[at + i] = 1.0 if i >= keep_from and keep_from > 0 and not is_bias else 0.0
     _close(m, at + n, RESTART)
+
+
+@njit(cache=True)
+def note_clone(m: Memory) -> None:
+    """Write down that the clone became the pose of now (`eskf.clone_pose`)."""
+    tape, x, at = m.tape, m.x, m.counters[TAPE_END]
+    px, py, pz = x[POSITION], x[POSITION + 1], x[POSITION + 2]
+    for i in range(9):
+        tape[at + i] = x[i]
+    for j in range(3):
+        tape[at + 9 + j] = py * x[6 + j] - pz * x[3 + j]
+        tape[at + 12 + j] = pz * x[j] - px * x[6 + j]
+        tape[at + 15 + j] = px * x[3 + j] - py * x[j]
+    _close(m, at + 18, CLONING)
 
 
 @njit(cache=True)

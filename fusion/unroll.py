@@ -9,6 +9,7 @@ from fusion.eskf import inject, transport
 from fusion.nav_state import (
     ACCEL_BIAS_ERROR,
     AT_BIASES,
+    AT_CLONE,
     AT_GRAVITY,
     AT_OBJECTS,
     CORE,
@@ -20,7 +21,7 @@ from fusion.nav_state import (
     Array,
     Ints,
 )
-from fusion.tape import CORRECTION, DECAY, FORGETTING, MEETING, ODOMETRY, ROW, STEP, TAIL
+from fusion.tape import CLONING, CORRECTION, DECAY, FORGETTING, MEETING, ODOMETRY, ROW, STEP, TAIL
 
 
 @njit(cache=True)
@@ -59,6 +60,8 @@ def unroll(
             _back_over_odometry(record, gradient, information, work)
         elif kind == MEETING:
             _back_over_meeting(record, layout[N_ERROR], gradient, information)
+        elif kind == CLONING:
+            _back_over_cloning(record, layout, gradient, information)
         elif kind == FORGETTING:
             for i in range(int(record[1])):
                 _scale(information, gradient, layout[N_ERROR], int(record[0]) + i, 0.0)
@@ -210,6 +213,27 @@ def _back_over_correction(record: Array, layout: Ints, gradient: Array, informat
                 information[row, j] -= h * U[r, j]
             for j in range(n):
                 information[j, row] -= h * U[r, j]
+
+
+@njit(cache=True)
+def _back_over_cloning(record: Array, layout: Ints, gradient: Array, information: Array) -> None:
+    """Go back over xi = R theta, rho = dp + [p]x R theta: what the future says of the clone, it says of the pose."""
+    n, at = layout[N_ERROR], layout[AT_CLONE]
+    _give_to_pose(record, at, gradient)
+    for j in range(n):
+        _give_to_pose(record, at, information[:, j])
+    for j in range(n):
+        _give_to_pose(record, at, information[j])
+    for i in range(6):
+        _scale(information, gradient, n, at + i, 0.0)
+
+
+@njit(cache=True)
+def _give_to_pose(record: Array, at: int, X: Array) -> None:
+    for i in range(3):
+        X[POSITION_ERROR + i] += X[at + 3 + i]
+        for k in range(3):
+            X[i] += record[3 * k + i] * X[at + k] + record[9 + 3 * k + i] * X[at + 3 + k]
 
 
 @njit(cache=True)

@@ -6,8 +6,16 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from fusion import imu, measurements
-from fusion.nav_state import TIME_OFFSET, StateLayout, gravity_tangent, local_state, nominal_state, retract_state
+from fusion import eskf, imu, measurements
+from fusion.nav_state import (
+    TIME_OFFSET,
+    StateLayout,
+    gravity_tangent,
+    local_state,
+    nominal_state,
+    put_pose,
+    retract_state,
+)
 from poet_loc.core.geometry import make_pose
 
 LAYOUTS = [
@@ -39,9 +47,18 @@ def evaluate(kind, k, R_m, t_m, x, rate, layout, nominal_offset=0.0):
     return residual, dense
 
 
-@pytest.mark.parametrize("layout", LAYOUTS)
-@pytest.mark.parametrize("kind", [measurements.CAMERA_POSE, measurements.OBJECT_POSE])
-def test_jacobian_is_the_derivative_of_the_residual(layout, kind):
+WITH_CLONE = [
+    StateLayout(n_objects=1, clone=True),
+    StateLayout(n_objects=1, extrinsics=True, time_offset=True, objects=True, bias_kinds=1, clone=True),
+]
+
+
+@pytest.mark.parametrize(
+    ("kind", "layout"),
+    [(kind, layout) for kind in (measurements.CAMERA_POSE, measurements.OBJECT_POSE) for layout in LAYOUTS]
+    + [(measurements.ODOMETRY_STEP, layout) for layout in WITH_CLONE],
+)
+def test_jacobian_is_the_derivative_of_the_residual(kind, layout):
     rng = np.random.default_rng(5)
     for k in range(layout.n_objects):
         x = random_state(layout, rng)
@@ -85,6 +102,48 @@ def test_camera_residual_is_the_error_the_convention_states():
     t_m = T_world_cam.translation + e_t
     residual, _ = evaluate(measurements.CAMERA_POSE, -1, R_m, t_m, x, np.zeros(3), layout, 0.0)
     np.testing.assert_allclose(residual, np.r_[e_r, e_t], atol=1e-12)
+
+
+def test_odometry_residual_is_the_error_the_convention_states():
+    rng = np.random.default_rng(3)
+    layout = StateLayout(clone=True)
+    T_world_then, T_world_now, T_imu_cam = (RigidTransform.from_exp_coords(rng.normal(size=6)) for _ in range(3))
+    x = nominal_state(layout, T_world_imu=T_world_now, T_imu_cam=T_imu_cam)
+    put_pose(x, layout.clone_start, T_world_then)
+    T_then_cam = (T_world_then * T_imu_cam).inv() * T_world_now * T_imu_cam
+    e_r, e_t = 0.1 * rng.normal(size=3), 0.1 * rng.normal(size=3)
+    R_m = (T_then_cam.rotation * Rotation.from_rotvec(e_r)).as_matrix().ravel()
+    residual, _ = evaluate(
+        measurements.ODOMETRY_STEP, -1, R_m, T_then_cam.translation + e_t, x, np.zeros(3), layout, 0.0
+    )
+    np.testing.assert_allclose(residual, np.r_[e_r, e_t], atol=1e-12)
+
+
+@pytest.mark.parametrize("layout", WITH_CLONE)
+def test_a_clone_is_the_pose_with_its_error(layout):
+    """Its error is the derivative of cloning, so that the odometry from a pose to its own clone says nothing."""
+    rng = np.random.default_rng(4)
+    x, A = random_state(layout, rng), rng.normal(size=(layout.n_error, layout.n_error))
+    P, start = A @ A.T, layout.clone_start
+
+    def cloned(state):
+        state = state.copy()
+        state[start : start + 12] = state[:12]
+        return state
+
+    J = np.zeros_like(P)
+    for j in range(layout.n_error):
+        error = 1e-6 * np.eye(layout.n_error)[j]
+        ahead, behind = (cloned(retract_state(x, sign * error, layout)) for sign in (1, -1))
+        J[:, j] = (local_state(cloned(x), ahead, layout) - local_state(cloned(x), behind, layout)) / 2e-6
+    after, spread = x.copy(), P.copy()
+    eskf.clone_pose(after, spread, layout.as_integers())
+    np.testing.assert_array_equal(after, cloned(x))
+    np.testing.assert_allclose(spread, J @ P @ J.T, atol=1e-6 * np.abs(P).max())
+    np.testing.assert_array_equal(spread, spread.T)
+    still, H = evaluate(measurements.ODOMETRY_STEP, -1, np.eye(3).ravel(), np.zeros(3), after, np.zeros(3), layout)
+    np.testing.assert_allclose(still, 0.0, atol=1e-12)
+    np.testing.assert_allclose(H @ spread @ H.T, 0.0, atol=1e-9)
 
 
 def test_position_rows_do_not_touch_the_objects_rotation():

@@ -102,6 +102,43 @@ def test_auto_takes_the_best_there_is_and_says_so(log):
         fuse(replace(log, imu=None), FuseOptions(motion="imu"))
 
 
+def blinded(log, first_s: float, last_s: float):
+    """Return the log without detections in this time."""
+    seconds = (log.object_poses[""].stamps_ns - log.imu.stamps_ns[0]) * 1e-9
+    return replace(log, object_poses={"": log.object_poses[""][(seconds < first_s) | (seconds > last_s)]})
+
+
+def test_odometry_beside_the_imu_holds_the_drift_of_a_gap():
+    drift, sigma, nees = {}, {}, []
+    for seed in range(4):
+        log = blinded(simulate(SimulationOptions(duration_s=14.0, noise="white", odometry=True, seed=seed)), 6.0, 12.0)
+        at = int(log.imu.stamps_ns[0]) + 12 * 10**9
+        for motion in ("imu", "imu+odometry"):
+            result = fuse(log, FuseOptions(motion=motion))
+            assert result.motion == motion
+            assert len(result.gate) == len(log.object_poses[""])
+            row = np.searchsorted(result.stamps_ns, at)
+            truth, _ = log.T_world_imu.interpolate(result.stamps_ns[[row]])
+            error = result.T_world_imu.translation[row] - truth.translation[0]
+            drift.setdefault(motion, []).append(np.linalg.norm(error))
+            sigma.setdefault(motion, []).append(np.linalg.norm(result.sigmas[row, 3:6]))
+            if motion != "imu":
+                nees.append(error @ np.linalg.solve(result.pose_covariances[row, 3:, 3:], error) / 3.0)
+    assert np.mean(drift["imu+odometry"]) < 0.3 * np.mean(drift["imu"])
+    assert np.mean(sigma["imu+odometry"]) < 0.5 * np.mean(sigma["imu"])
+    assert np.mean(nees) < 3.0
+
+
+def test_odometry_beside_the_imu_is_smoothed_and_not_for_the_graph(log):
+    options = FuseOptions(motion="imu+odometry")
+    gap = blinded(log, 6.0, 10.0)
+    assert rmse(fuse(gap, replace(options, smooth=True)), log) < rmse(fuse(gap, options), log)
+    with pytest.raises(InputError, match="graph"):
+        fuse(log, replace(options, estimator="graph"))
+    with pytest.raises(InputError, match=r"T_odom_cam\.tum"):
+        fuse(replace(log, T_odom_cam=None), options)
+
+
 def test_without_calibration_the_camera_itself_is_followed(log):
     result = fuse(replace(log, imu=None, calibration=None))
     assert result.body == "cam"

@@ -10,6 +10,7 @@ from filter_runs import LAYOUTS, assert_same, run, simulated
 
 from fusion import filter_loop, memory, reference_filter
 from fusion.fuse import run_filter
+from fusion.measurements import ODOMETRY_STEP
 from fusion.options import DetectionNoise, Estimate, FuseOptions, Gate
 from fusion.prepare import pose_problem
 from poet_loc.io.log_folder import read_log
@@ -57,6 +58,18 @@ def test_compiled_is_plain_without_an_imu(motion):
     compiled, plain = (run(loop, problem, options) for loop in (filter_loop.run_log, reference_filter.run_log))
     assert_same(compiled, plain)
     assert np.count_nonzero(compiled.decisions) > 50
+
+
+@pytest.mark.parametrize("measurements", ["objects", "camera"])
+def test_compiled_is_plain_with_odometry_beside_the_imu(measurements):
+    options = FuseOptions(motion="imu+odometry", measurements=measurements, estimate=Estimate(extrinsics=True))
+    problem = simulated(measurements, options=options, odometry=True)
+    assert problem.layout.clone
+    compiled, plain = (run(loop, problem, options) for loop in (filter_loop.run_log, reference_filter.run_log))
+    assert_same(compiled, plain)
+    steps = problem.measurements.kinds == ODOMETRY_STEP
+    assert np.count_nonzero(compiled.decisions[steps]) > 20
+    assert np.count_nonzero(compiled.decisions[~steps]) > 50
 
 
 def test_run_reference_returns_what_run_filter_returns():

@@ -135,8 +135,8 @@ def test_smoothed_is_the_fixed_point_smoother_on_an_unknown_map(monkeypatch):
     assert_smoothed_like_fixed_point(monkeypatch, problem, options, 0.0)
 
 
-@pytest.mark.parametrize("motion", ["odometry", "constant-velocity"])
-def test_smoothed_is_the_fixed_point_smoother_without_an_imu(monkeypatch, motion):
+@pytest.mark.parametrize("motion", ["odometry", "constant-velocity", "imu+odometry"])
+def test_smoothed_is_the_fixed_point_smoother_on_other_motion(monkeypatch, motion):
     options = FuseOptions(motion=motion)
     problem = simulated(noise="network", options=options, odometry=True, duration_s=5.0)
     assert_smoothed_like_fixed_point(monkeypatch, problem, options, 0.4)
