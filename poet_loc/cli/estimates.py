@@ -102,8 +102,20 @@ def estimate_log(
     attempt.tell()
     if fused and fused[0].motion != "imu" and options.fusion.motion == "auto":
         report.note(f"{log.path}: no imu.csv: fused on {fused[0].motion.replace('-', ' ')} instead")
+    for result in fused:
+        _tell_of_moved_objects(log, result, report)
     evaluation = evaluate_estimates(log, name, _estimates(log, localized, fused), options.evaluation, report)
     return Estimates(log, name, localized, fused, evaluation)
+
+
+def _tell_of_moved_objects(log: Log, result: FuseResult, report: Report) -> None:
+    if result.health is None:
+        return
+    names = {each.key: each.name or f"object {each.object_id}" for each in log.landmark_map or ()}
+    begin_ns = int(result.health.since_ns[0])
+    for key, first, last in result.health.released:
+        span = f"left out from {(first - begin_ns) * 1e-9:.1f} s to {(last - begin_ns) * 1e-9:.1f} s"
+        report.note(f"{log.path}: {names[key]} was moved: {span} ({result.name})")
 
 
 def steps(modes: Sequence[Mode] = MODES, fusions: Sequence[Fusion] = FUSIONS) -> int:

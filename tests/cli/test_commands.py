@@ -373,3 +373,18 @@ def test_one_estimator_is_refused_where_several_run(command, clean_log, tmp_path
     paths = {"LOG": str(clean_log), "RUN": str(tmp_path / "run")}
     assert main([*(paths.get(word, word) for word in command), "--fusion.estimator", "graph"]) == 1
     assert "--fusions" in capsys.readouterr().err
+
+
+def test_fuse_names_an_object_that_was_moved_and_takes_odometry_beside_the_imu(tmp_path, capsys):
+    log, out = tmp_path / "log", tmp_path / "run"
+    world = ["--odometry", "--duration-s", "24", "--objects", "4", "--symmetric-objects", "0", "--imu-rate-hz", "100"]
+    moved = ["--moved.object", "1", "--moved.after-s", "10", "--camera-rate-hz", "15"]
+    assert main(["simulate", "--out", str(log), *world, *moved]) == 0
+    capsys.readouterr()
+    assert main(["fuse", str(log), "--out", str(out), "--motion", "imu+odometry", "--no-pictures"]) == 0
+    told = capsys.readouterr()
+    assert "was moved: left out from 1" in told.out + told.err
+    health = json.loads((out / "health.json").read_text())
+    assert [each["object_id"] for each in health["released"]] == [2]
+    assert [each["released"] for each in health["objects"]] == [False, True, False, False]
+    assert health["share_of_time"]["tracking"] > 0.9
