@@ -62,6 +62,7 @@ from fusion.so3_kernels import (
 
 Array = NDArray[np.float64]
 CAMERA_POSE, OBJECT_POSE, ODOMETRY_STEP = 0, 1, 2
+BEFORE_POSES = -2  # what odometry has in the place of a landmark: sorts it before the poses of its stamp
 MAX_COLUMNS = 34  # attitude 3, position 3, extrinsics 6, object 6, two biases 12, velocity 3, time offset 1
 
 
@@ -74,7 +75,7 @@ class Measurements:
     kinds: NDArray[np.int64]
     """(M,) CAMERA_POSE, OBJECT_POSE or ODOMETRY_STEP; of one stamp, odometry comes first."""
     objects: NDArray[np.int64]
-    """(M,) index of the landmark, -1 for the others."""
+    """(M,) index of the landmark, -1 for a camera pose, BEFORE_POSES for odometry."""
     rotations: Array
     """(M, 9) row-major: R_cam_obj, R_world_cam or R_then_cam."""
     translations: Array

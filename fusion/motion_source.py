@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import RigidTransform
 
-from fusion.measurements import ODOMETRY_STEP, Measurements
+from fusion.measurements import BEFORE_POSES, ODOMETRY_STEP, Measurements
 from fusion.odometry import odometry_samples
 from fusion.options import FuseOptions
 from poet_loc.core.input_error import InputError
@@ -69,15 +69,20 @@ def odometry_steps(log: Log, calibration: Calibration, options: FuseOptions) -> 
             kept.append(k)
     poses, count = T_odom_cam.T_world_body[kept], len(kept)
     moved = RigidTransform.concatenate([RigidTransform.identity(), poses[:-1].inv() * poses[1:]])
-    sigma = np.repeat([np.radians(walk.rotation_walk_deg), walk.translation_walk], 3)
     return Measurements(
         T_odom_cam.stamps_ns[kept] + round(calibration.timeshift_cam_imu_s * 1e9),
         np.full(count, ODOMETRY_STEP, dtype=np.int64),
-        np.full(count, -1, dtype=np.int64),
+        np.full(count, BEFORE_POSES, dtype=np.int64),
         moved.rotation.as_matrix().reshape(-1, 9),
         np.ascontiguousarray(moved.translation),
-        np.diff(seconds[kept], prepend=-1.0)[:, None, None] * np.diag(sigma**2),
+        np.diff(seconds[kept], prepend=-1.0)[:, None, None] * odometry_spread(options),
     )
+
+
+def odometry_spread(options: FuseOptions) -> NDArray[np.float64]:
+    """Return the covariance (6, 6) of [e_r, e_t] that a second of odometry gathers."""
+    walk = options.odometry
+    return np.diag(np.repeat([np.radians(walk.rotation_walk_deg), walk.translation_walk], 3) ** 2)
 
 
 def _odometry_of(log: Log) -> Trajectory:

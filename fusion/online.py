@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import math
 import operator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import SupportsIndex
 
@@ -24,8 +24,15 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from fusion import memory, replay, replay_memory
 from fusion.health import Mode, ObjectHealth, mode_of
-from fusion.measurements import CAMERA_POSE, OBJECT_POSE, Measurements, ray_aligned_covariance
-from fusion.motion_source import scaled_noise
+from fusion.measurements import (
+    BEFORE_POSES,
+    CAMERA_POSE,
+    OBJECT_POSE,
+    ODOMETRY_STEP,
+    Measurements,
+    ray_aligned_covariance,
+)
+from fusion.motion_source import odometry_spread, scaled_noise
 from fusion.nav_state import ACCEL_BIAS, CORE, GYRO_BIAS, POSITION, VELOCITY, StateLayout
 from fusion.options import FuseOptions
 from fusion.place_watch import (
@@ -124,7 +131,8 @@ class Health:
 class Estimator:
     """The error-state filter on an IMU, fed one sample at a time.
 
-    options.measurements says whether poses of objects (needs the map) or of the camera come in; layout switches states
+    options.measurements says whether poses of objects (needs the map) or of the camera come in, options.motion
+    (imu+odometry) whether odometry comes in beside the IMU; layout switches states
     on beyond what the options ask for. Raises InputError where calibration or map lack what the filter needs.
     The first call compiles or loads the kernels: construct it, which does that, before the loop runs.
     """
@@ -169,6 +177,7 @@ class Estimator:
         self._ring = replay_memory.ring_views.py_func(self._ring_floats, self._ring_integers)
         self._rate, self._force = self._ring.sample[:3], self._ring.sample[3:]
         self._not_in_map = 0
+        self._odometry: tuple[int, Array, Array] | None = None
         self._feed(replay.POSES, 0, 0)
 
     def feed_imu(self, stamp_ns: SupportsIndex, angular_velocity: ArrayLike, specific_force: ArrayLike) -> None:
@@ -217,6 +226,32 @@ class Estimator:
         R = self._camera_covariance if covariance is None else np.asarray(covariance, dtype=float)
         rotation = Rotation.from_quat(np.asarray(q_xyzw, dtype=float)).as_matrix()
         self._feed_poses(stamp_ns, CAMERA_POSE, np.array([-1]), rotation, np.asarray(position, dtype=float), R)
+
+    def feed_odometry(self, stamp_ns: SupportsIndex, position: ArrayLike, q_xyzw: ArrayLike) -> None:
+        """Take in a camera pose T_odom_cam of odometry, of which only the motion since earlier ones is used.
+
+        stamp_ns on the camera's clock, position (3,) m, quaternion (4,) scalar last. Odometry must come in its own
+        order: what is not newer than the last is ignored; against poses and IMU it may be late. Raises InputError
+        unless options.motion is imu+odometry, ValueError for a zero quaternion.
+        """
+        if not self.layout.clone:
+            raise InputError("there is no state to measure odometry against", fix="choose --motion imu+odometry")
+        stamp, t = operator.index(stamp_ns), np.asarray(position, dtype=float)
+        R = Rotation.from_quat(np.asarray(q_xyzw, dtype=float)).as_matrix()
+        then_ns, R_then, t_then = self._odometry or (stamp - 10**9, R, t)
+        seconds = (stamp - then_ns) * 1e-9
+        if seconds <= 0.0 or (self._odometry is not None and seconds < self.options.odometry.step_s - 1e-6):
+            return
+        refused, spread = self._refused(), seconds * odometry_spread(self.options)
+        moved = R_then.T @ R, R_then.T @ (t - t_then)
+        self._feed_poses(stamp, ODOMETRY_STEP, np.array([BEFORE_POSES]), *moved, spread)
+        if self._refused() == refused:  # else the next one is measured against the same pose as this
+            self._odometry = stamp, R, t
+
+    def _refused(self) -> int:
+        h = self._ring.header
+        refusals = (replay_memory.TOO_LATE, replay_memory.TOO_EARLY, replay_memory.MALFORMED, replay_memory.OVERFLOWED)
+        return sum(int(h[each]) for each in refusals)
 
     def state(self) -> OnlineState | None:
         """Return what is known at the newest IMU sample, None before the start."""
@@ -311,12 +346,13 @@ def _object_health(row: Array, released: bool) -> ObjectHealth:
 def _empty_problem(
     calibration: Calibration, landmark_map: LandmarkMap | None, options: FuseOptions, layout: StateLayout | None
 ) -> Problem:
-    if options.motion not in ("auto", "imu"):
+    if options.motion not in ("auto", "imu", "imu+odometry"):
         raise InputError(f"the online estimator moves by an IMU, not by {options.motion}", fix="leave --motion out")
     if calibration.imu is None or calibration.T_cam_imu is None:
         raise InputError("fusion needs T_cam_imu and the IMU's noise densities", fix="add them to the calibration")
     if options.measurements == "objects" and landmark_map is None:
         raise InputError("object poses need a map", fix="give landmark_map, or fuse camera poses")
+    layout = layout or layout_for(landmark_map, options)
     nothing, none = np.empty(0), np.empty(0, dtype=np.int64)
     return Problem(
         Path("online"),
@@ -324,7 +360,7 @@ def _empty_problem(
         scaled_noise(calibration.imu, options),
         calibration,
         Measurements(none, none, none, nothing.reshape(0, 9), nothing.reshape(0, 3), nothing.reshape(0, 6, 6)),
-        layout or layout_for(landmark_map, options),
+        replace(layout, clone=options.motion == "imu+odometry"),
         landmark_map,
     )
 

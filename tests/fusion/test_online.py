@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import fields, replace
 
 import numpy as np
 import pytest
@@ -10,10 +10,11 @@ from filter_runs import LAYOUTS, run, simulated
 from scipy.spatial.transform import Rotation
 
 from fusion import filter_loop, memory
-from fusion.measurements import CAMERA_POSE
+from fusion.measurements import CAMERA_POSE, ODOMETRY_STEP, Measurements
 from fusion.online import Estimator, OnlineOptions
-from fusion.options import FuseOptions
+from fusion.options import FuseOptions, Odometry
 from fusion.prepare import Problem, pose_problem
+from fusion.simulate import SimulationOptions, simulate
 from poet_loc.core.input_error import InputError
 from poet_loc.io.log_folder import read_log
 
@@ -247,6 +248,53 @@ def test_the_whole_log_on_real_data(shared_data):
     inside = problem.measurements.stamps_ns <= problem.imu.stamps_ns[-1]
     assert np.count_nonzero(inside) > 300
     assert_ends_like(estimator, problem, options)
+
+
+@pytest.mark.parametrize("lateness_s", [0.0, 0.3])
+def test_odometry_is_fed_beside_the_imu(lateness_s):
+    options = FuseOptions(motion="imu+odometry")
+    wanted = SimulationOptions(duration_s=6.0, imu_rate_hz=100.0, camera_rate_hz=15.0, objects=3, odometry=True)
+    log = simulate(wanted)
+    problem = pose_problem(log, options)
+    steps = problem.measurements.kinds == ODOMETRY_STEP
+    assert np.count_nonzero(steps) > 15
+    poses = replace(problem, measurements=replace_rows(problem.measurements, ~steps))
+    seconds = np.random.default_rng(0).uniform(0.0, lateness_s, len(log.T_odom_cam))
+    arrivals = np.maximum.accumulate(log.T_odom_cam.stamps_ns + (seconds * 1e9).astype(np.int64))
+    waiting = list(zip(arrivals, log.T_odom_cam.stamps_ns, log.T_odom_cam.T_world_body))
+    estimator = estimator_for(problem, options)
+    for event in events(poses):
+        while waiting and waiting[0][0] <= event[0]:
+            _, stamp, T = waiting.pop(0)
+            estimator.feed_odometry(stamp, T.translation, T.rotation.as_quat())
+        feed(estimator, poses, event)
+    assert_ends_like(estimator, problem, options)
+
+
+def test_odometry_that_was_refused_is_made_up_for_by_the_next():
+    options = FuseOptions(motion="imu+odometry", odometry=Odometry(step_s=0.1))
+    log = simulate(SimulationOptions(duration_s=6.0, camera_rate_hz=10.0, objects=3, noise="white", odometry=True))
+    poses = pose_problem(log, FuseOptions())
+    estimator = estimator_for(replace(poses, layout=replace(poses.layout, clone=True)), options)
+    odometry = dict(zip(log.T_odom_cam.stamps_ns.tolist(), log.T_odom_cam.T_world_body))
+    sent = 0
+    for event in events(poses):
+        feed(estimator, poses, event)
+        if event[1] == 0:
+            T, broken = odometry[event[0]], event[0] // 10**8 % 3 == 0
+            place = np.full(3, np.nan) if broken else T.translation
+            estimator.feed_odometry(event[0], place, T.rotation.as_quat())
+            estimator.feed_odometry(event[0] - 1, T.translation, T.rotation.as_quat())  # out of its order: ignored
+            sent += broken
+    assert estimator.health().malformed == sent > 10
+    truth, _ = log.T_world_imu.interpolate(np.array([estimator.state().stamp_ns]))
+    assert np.linalg.norm(estimator.state().position - truth.translation[0]) < 0.03
+    with pytest.raises(InputError, match="odometry"):
+        estimator_for(poses, FuseOptions()).feed_odometry(0, np.zeros(3), [0.0, 0.0, 0.0, 1.0])
+
+
+def replace_rows(measurements: Measurements, rows: np.ndarray) -> Measurements:
+    return Measurements(*(getattr(measurements, each.name)[rows] for each in fields(Measurements)))
 
 
 def test_missing_calibration_and_map_are_said_so():
