@@ -26,6 +26,7 @@ from fusion.graph_walk import Keyframe, Walk
 from fusion.measurements import OBJECT_POSE
 from fusion.nav_state import CORE
 from fusion.options import FuseOptions, Graph
+from fusion.place_watch import RELEASED
 from fusion.prepare import Problem
 from fusion.result import FuseResult
 
@@ -174,6 +175,8 @@ def _decide(stretch: Stretch, builder: GraphBuilder, walk: Walk) -> bool:
     for i, keyframe in enumerate(stretch.keyframes):
         later = stretch.keyframes[i + 1].between if i + 1 < len(stretch.keyframes) else range(0)
         for j in (*(keyframe.at if i else ()), *later):
+            if decisions[j] & RELEASED:
+                continue
             d = detection_of(builder, walk, j, keyframe.stamp_ns, stretch.states[i], ACCEPTED)
             decision = _gate(d, stretch.states[i], stretch.spread[i], builder, walk, j)
             changed |= decision != decisions[j]

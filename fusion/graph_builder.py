@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Iterable
 from dataclasses import dataclass
 
@@ -42,8 +43,8 @@ class BiasModel:
         return np.array([eskf.bias_sigma(self.values, kind, i) for i in range(6)])
 
     def jumped(self, kind: int) -> Array:
-        """Return the 1-sigma (6,) after a jump."""
-        return float(self.values[kind * eskf.BIAS_MODEL_SIZE + eskf.BIAS_JUMP]) * self.stationary(kind)
+        """Return the 1-sigma (6,) of a bias that was forgotten: the varying one has jumped."""
+        return self.stationary(kind) * (float(self.values[eskf.BIAS_JUMP]) if kind == 0 else 1.0)
 
     def step(self, kind: int, mean: Array, seconds: float) -> tuple[Array, Array]:
         """Return factor and 1-sigma, each (6,), of what a bias does in some seconds (`eskf.decay_biases`)."""
@@ -87,6 +88,14 @@ class GraphBuilder:
     def _clear(self) -> None:
         self.graph, self.values = gtsam.NonlinearFactorGraph(), gtsam.Values()
         self.keyframes: dict[int, int] = {}
+
+    def fork(self) -> GraphBuilder:
+        """Return a copy, of a builder whose additions have been taken, that may go its own way."""
+        other = copy.copy(self)
+        other._clear()
+        other.x, other._statics = self.x.copy(), self._statics.copy()
+        other.chains = {which: copy.copy(chain) for which, chain in self.chains.items()}
+        return other
 
     def take(self) -> tuple[gtsam.NonlinearFactorGraph, gtsam.Values, dict[int, int]]:
         """Return what was added since the last call: factors, initial values, each variable's keyframe."""

@@ -7,6 +7,7 @@ only, the oldest variables are leaves, and the joint covariance of the newest st
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Sequence
 
 import gtsam
@@ -14,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import solve_triangular
 
-from fusion.eskf import POSITION_ONLY, ROTATION_ONLY
+from fusion.eskf import ACCEPTED, POSITION_ONLY, ROTATION_ONLY
 from fusion.graph_builder import GraphBuilder
 from fusion.graph_factors import Detection
 from fusion.graph_variables import block_diagonal
@@ -35,6 +36,30 @@ class FixedLagSmoother:
         self._came: dict[int, int] = {}
         self._lasting: set[int] = set()
         self._first = builder.keyframe + 1
+        self._factors, self._theta = gtsam.NonlinearFactorGraph(), gtsam.Values()
+
+    def kept(self) -> FixedLagSmoother:
+        """Return what `revived` needs to begin from here again; it shares nothing with this one that changes."""
+        other = self._copy()
+        factors, other._factors = self._isam.getFactorsUnsafe(), gtsam.NonlinearFactorGraph()
+        for factor in (factors.at(i) for i in range(factors.size())):
+            if factor is not None:
+                other._factors.add(factor)
+        other._theta = gtsam.Values(self._isam.getLinearizationPoint())
+        del other._isam
+        return other
+
+    def revived(self) -> FixedLagSmoother:
+        """Return a smoother that goes on from what was kept, its window eliminated anew."""
+        other = self._copy()
+        other._isam = gtsam.ISAM2(isam_parameters(self._options))
+        other._eliminate(self._factors, self._theta, self._came, True)
+        return other
+
+    def _copy(self) -> FixedLagSmoother:
+        other = copy.copy(self)
+        other.builder, other._came, other._lasting = self.builder.fork(), self._came.copy(), self._lasting.copy()
+        return other
 
     def start(self, keyframe: Keyframe, walk: Walk) -> None:
         """Begin at a keyframe with the filter's state as prior."""
@@ -132,6 +157,7 @@ def isam_parameters(options: Graph) -> gtsam.ISAM2Params:
     params.setRelinearizeThreshold(options.relinearize)
     params.relinearizeSkip = 1_000_000_000  # only where it is asked for
     params.findUnusedFactorSlots = True
+    params.setOptimizationParams(gtsam.ISAM2GaussNewtonParams(0.0))  # every change is carried through, however small
     return params
 
 
@@ -151,7 +177,7 @@ def forget_biases(builder: GraphBuilder, keyframe: Keyframe) -> None:
 
 def detections(builder: GraphBuilder, walk: Walk, which: range) -> list[Detection]:
     """Return the measurements of a keyframe that passed the gate, as the filter used them."""
-    decided = ((i, int(walk.columns.decisions[i])) for i in which)
+    decided = ((i, int(walk.columns.decisions[i]) & ACCEPTED) for i in which)
     return [detection_of(builder, walk, i, builder.stamp_ns, builder.x, passed) for i, passed in decided if passed]
 
 
@@ -164,9 +190,9 @@ def detection_of(builder: GraphBuilder, walk: Walk, i: int, keyframe_ns: int, x:
         int(c.objects[i]),
         first,
         end - first,
-        walk.rotations[i],
-        c.translations[i],
-        walk.covariances[i],
+        walk.rotations[i].copy(),
+        c.translations[i].copy(),
+        walk.covariances[i].copy(),
         chain.motion(keyframe_ns, stamp, x),
         chain.rate(stamp, x),
         stamp != keyframe_ns,

@@ -202,47 +202,60 @@ class Walk:
         self.columns = loop_columns(problem)
         count = len(problem.measurements)
         self.rotations, self.covariances = np.zeros((count, 9)), np.zeros((count, 6, 6))
-        self._cursor = np.zeros(CURSOR_SIZE, dtype=np.int64)
-        self._fresh = np.zeros(2 * max(1, problem.layout.n_objects * problem.layout.bias_kinds), dtype=np.int64)
+        self.cursor = np.zeros(CURSOR_SIZE, dtype=np.int64)
+        self.begun, self.first = False, 0
+        self.fresh = np.zeros(2 * max(1, problem.layout.n_objects * problem.layout.bias_kinds), dtype=np.int64)
         self._spacing_ns = round(0.999e9 / options.graph.keyframe_rate_hz)
         self._idle_ns = round(options.graph.idle_s * 1e9)
 
     @property
     def rows(self) -> tuple[Ints, Array, Array, Array]:
         """What was written so far: stamps, core, sigmas, covariances."""
-        n, c = self._cursor[ROWS], self.columns
+        n, c = self.cursor[ROWS], self.columns
         return c.out_stamps[:n], c.out_core[:n], c.out_sigma[:n], c.out_covariance[:n].reshape(-1, 6, 6)
 
     def keyframes(self) -> Iterator[Keyframe]:
         """Yield the keyframes of the whole log, the last one at its end."""
-        c, cursor, first = self.columns, self._cursor, 0
-        begin_log(self.floats, self.integers, cursor, c.imu_stamps, c.imu_values, c.stamps)
-        while True:
-            fresh, newest = self._fresh.copy(), cursor[KEYFRAME_NS]
-            event = filter_until_keyframe(
-                self.floats,
-                self.integers,
-                cursor,
-                self._spacing_ns,
-                self._idle_ns,
-                *c[:8],
-                self.rotations,
-                self.covariances,
-                self._fresh,
-                *c[8:],
-            )
-            stamp, last = int(self.memory.counters[NOW]), int(cursor[NEXT])
-            if event == END and (cursor[ROWS] == 0 or stamp == newest):
-                return
-            here = first + int(np.searchsorted(c.stamps[first:last], stamp))
-            forgotten = ((self._fresh > 0) & (fresh == 0)).reshape(-1, 2)
-            yield Keyframe(stamp, event == STARTED, forgotten, range(first, here), range(here, last))
-            first = last
-            if event == END:
-                return
+        while (keyframe := self.next_keyframe()) is not None:
+            yield keyframe
+
+    def begin(self) -> None:
+        """Put the filter at the first sample."""
+        c, self.begun = self.columns, True
+        begin_log(self.floats, self.integers, self.cursor, c.imu_stamps, c.imu_values, c.stamps)
+
+    def next_keyframe(self, to_the_end: bool = True) -> Keyframe | None:
+        """Walk on to the next keyframe; None where there are no more samples.
+
+        to_the_end: the last samples are the log's, so a keyframe is due there too.
+        """
+        c, cursor, fresh, newest = self.columns, self.cursor, self.fresh.copy(), int(self.cursor[KEYFRAME_NS])
+        if not self.begun:
+            self.begin()
+        event = filter_until_keyframe(
+            self.floats,
+            self.integers,
+            cursor,
+            self._spacing_ns,
+            self._idle_ns,
+            *c[:8],
+            self.rotations,
+            self.covariances,
+            self.fresh,
+            *c[8:],
+        )
+        stamp, last = int(self.memory.counters[NOW]), int(cursor[NEXT])
+        if event == END:
+            if not to_the_end or cursor[ROWS] == 0 or stamp == newest:
+                return None
+            cursor[KEYFRAME_NS] = stamp
+        first, self.first = self.first, last
+        here = first + int(np.searchsorted(c.stamps[first:last], stamp))
+        forgotten = ((self.fresh > 0) & (fresh == 0)).reshape(-1, 2)
+        return Keyframe(stamp, event == STARTED, forgotten, range(first, here), range(here, last))
 
     def rewrite(self) -> None:
         """Write the newest row again after a correction of the memory."""
         c = self.columns
         out = (c.out_stamps, c.out_core, c.out_sigma, c.out_covariance)
-        rewrite_row(self.floats, self.integers, self._cursor, *out)
+        rewrite_row(self.floats, self.integers, self.cursor, *out)

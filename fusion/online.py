@@ -146,7 +146,7 @@ class Estimator:
         layout: StateLayout | None = None,
     ) -> None:
         self.options, self.online = options or FuseOptions(), online or OnlineOptions()
-        problem = _empty_problem(calibration, landmark_map, self.options, layout)
+        problem = empty_problem(calibration, landmark_map, self.options, layout)
         self.layout, self.keys = problem.layout, problem.keys
         self._floats, self._integers = fill_memory(problem, self.options)
         self.memory = memory.views.py_func(self._floats, self._integers)
@@ -343,9 +343,10 @@ def _object_health(row: Array, released: bool) -> ObjectHealth:
     )
 
 
-def _empty_problem(
+def empty_problem(
     calibration: Calibration, landmark_map: LandmarkMap | None, options: FuseOptions, layout: StateLayout | None
 ) -> Problem:
+    """Return the problem of an estimator that has been fed nothing yet."""
     if options.motion not in ("auto", "imu", "imu+odometry"):
         raise InputError(f"the online estimator moves by an IMU, not by {options.motion}", fix="leave --motion out")
     if calibration.imu is None or calibration.T_cam_imu is None:

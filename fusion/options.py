@@ -83,7 +83,7 @@ class Gate:
 
 @dataclass(frozen=True)
 class Moved:
-    """An object that stands elsewhere than the map says, while all others agree, is released from the map (eskf).
+    """An object that stands elsewhere than the map says, while all others agree, is released from the map.
 
     It is told from a network's gross errors by standing still in the world while the camera moves, and from its biases
     by their size. A released object corrects nothing, and one that was turned where it stands only by its position,
@@ -93,8 +93,8 @@ class Moved:
     release: bool = True
     """Release objects that were moved."""
     then: Literal["leave-out", "re-estimate"] = "leave-out"
-    """re-estimate: where a released object stands still, its pose is estimated anew as that of an unknown object, and
-    the objects' poses are states from the start on."""
+    """re-estimate (eskf): where a released object stands still, its pose is estimated anew as that of an unknown
+    object, and the objects' poses are states from the start on."""
     distance: float = 0.05
     """An object has been moved where the mean of its detections is further off the map than this, m,"""
     angle_deg: float = 15.0

@@ -304,8 +304,8 @@ def _start(options: FuseOptions) -> list[float]:
 def _moved(options: FuseOptions) -> list[float]:
     moved = options.moved
     values = {
-        place_watch.RELEASE: moved.release and options.estimator == "eskf",
-        place_watch.RE_ESTIMATE: moved.then == "re-estimate",
+        place_watch.RELEASE: moved.release,
+        place_watch.RE_ESTIMATE: re_estimates(options),
         place_watch.DISTANCE: moved.distance,
         place_watch.ANGLE: math.radians(moved.angle_deg),
         place_watch.SIGMAS: moved.sigmas,

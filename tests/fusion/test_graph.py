@@ -13,7 +13,7 @@ from fusion.fuse import fuse, run_filter
 from fusion.graph import run_graph
 from fusion.graph_smoother import FixedLagSmoother, joint_covariance
 from fusion.options import DetectionBias, Estimate, FuseOptions, Graph
-from fusion.simulate import SimulationOptions, simulate_with_truth
+from fusion.simulate import Displacement, SimulationOptions, simulate_with_truth
 from poet_loc.core.consistency import pose_nees
 from poet_loc.core.input_error import InputError
 
@@ -204,6 +204,23 @@ def test_the_graph_is_as_accurate_and_as_honest_as_the_filter():
     causal, graph = (np.mean(np.square(rows), axis=0) ** 0.5 for rows in errors.values())
     assert np.all(graph[:2] < 1.1 * causal[:2])
     assert graph[2] < 1.2 * causal[2]
+
+
+@pytest.mark.parametrize("estimator", ["graph", "batch"])
+def test_an_object_that_was_moved_leaves_the_graph_too(estimator):
+    rates = {"imu_rate_hz": 100.0, "camera_rate_hz": 10.0}
+    moved = Displacement(1, 14.0, np.inf, 0.2, 0.0)
+    log, _ = simulate_with_truth(
+        SimulationOptions(duration_s=30.0, seed=2, objects=4, symmetric_objects=0, moved=moved, **rates)
+    )
+    result = fuse(log, FuseOptions(estimator=estimator))
+    assert [key for key, _, _ in result.health.released] == [(2, 0)]
+    released = result.gate.released
+    assert np.count_nonzero(released) > 20
+    assert not np.any(result.gate.position_accepted[released])
+    assert not np.any(result.gate.rotation_accepted[released])
+    assert np.all(np.isfinite(result.sigmas))
+    assert rms_errors(result, log.T_world_imu)[0] < 0.05
 
 
 def test_a_log_on_which_the_filter_never_starts_says_so():

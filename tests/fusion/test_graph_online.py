@@ -1,0 +1,130 @@
+"""The graph fed sample by sample, in order and out of it, against the graph on the whole log."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from filter_runs import simulated
+
+from fusion.graph import run_graph
+from fusion.graph_online import GraphEstimator
+from fusion.online import OnlineOptions
+from fusion.options import Estimate, FuseOptions, Graph
+from fusion.prepare import time_shift_ns
+
+OPTIONS = FuseOptions(estimator="graph", graph=Graph(lag_s=0.8))
+
+
+class Feed:
+    """A problem's samples and poses, given to an estimator in any order of arrival."""
+
+    def __init__(self, problem, options, **online):
+        self.problem, self.layout = problem, problem.layout
+        self.estimator = GraphEstimator(
+            problem.calibration, problem.landmark_map, options, OnlineOptions(**online), problem.layout
+        )
+
+    def sample(self, i):
+        imu = self.problem.imu
+        self.estimator.feed_imu(imu.stamps_ns[i], imu.angular_velocity[i], imu.specific_force[i])
+
+    def pose(self, j):
+        m = self.problem.measurements
+        stamp = int(m.stamps_ns[j]) - time_shift_ns(self.problem.calibration)
+        rows = slice(j, j + 1)
+        columns = m.rotations[rows], m.translations[rows], m.covariances[rows]
+        self.estimator._feed_poses(stamp, int(m.kinds[j]), m.objects[rows], *columns)
+
+    def all(self, delays_ns, states_from=np.inf):
+        """Feed everything by time of arrival; return the states at the samples."""
+        imu, m, states = self.problem.imu.stamps_ns, self.problem.measurements.stamps_ns, {}
+        events = [(int(t), 1, i) for i, t in enumerate(imu)]
+        events += [(int(t) + int(d), 0, j) for j, (t, d) in enumerate(zip(m, delays_ns, strict=True))]
+        for arrival, is_sample, i in sorted(events):
+            self.sample(i) if is_sample else self.pose(i)
+            if is_sample and arrival >= states_from:
+                states[arrival] = self.estimator.state()
+        return states
+
+
+def assert_same_state(state, result, tolerance):
+    row = int(np.searchsorted(result.stamps_ns, state.stamp_ns))
+    assert result.stamps_ns[row] == state.stamp_ns
+    np.testing.assert_allclose(state.position, result.T_world_imu.translation[row], atol=tolerance)
+    np.testing.assert_allclose(state.R_world_imu, result.T_world_imu.rotation[row].as_matrix(), atol=tolerance)
+    np.testing.assert_allclose(state.velocity, result.velocity[row], atol=10 * tolerance)
+    np.testing.assert_allclose(state.sigmas, result.sigmas[row], rtol=1e3 * tolerance)
+
+
+@pytest.fixture(scope="module")
+def problem():
+    return simulated(options=OPTIONS)
+
+
+@pytest.fixture(scope="module")
+def whole(problem):
+    return run_graph(problem, OPTIONS)
+
+
+def test_in_order_it_is_the_graph_on_the_whole_log(problem, whole):
+    feed = Feed(problem, OPTIONS)
+    states = feed.all(np.zeros(len(problem.measurements)), whole.stamps_ns[0])
+    assert len(states) > 300
+    # the log's end is a keyframe of its own, and a state before the poses of its stamp have come does not know them
+    waiting = set(problem.measurements.stamps_ns.tolist())
+    checked = [s for t, s in states.items() if s is not None and t not in waiting and t < whole.stamps_ns[-1]]
+    for state in checked:
+        assert_same_state(state, whole, 1e-9)
+    assert len(checked) > 250
+    assert feed.estimator.health().too_late == 0
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_late_and_shuffled_poses_give_the_result_in_order(problem, whole, seed):
+    """Each pose comes up to 0.7 s late, so that a frame's come one by one and later frames before earlier ones."""
+    rng = np.random.default_rng(seed)
+    stamps = problem.measurements.stamps_ns
+    delays = rng.uniform(0.0, 0.7e9, len(stamps))
+    last = problem.imu.stamps_ns[-2]
+    delays = np.minimum(delays, np.maximum(last - stamps, 0))
+    feed = Feed(problem, OPTIONS)
+    states = feed.all(delays, last)
+    assert feed.estimator.health().replays > 50
+    assert feed.estimator.health().too_late == 0
+    assert_same_state(states[last], whole, 1e-9)
+
+
+def test_poses_older_than_the_lag_are_refused_and_counted(problem):
+    feed = Feed(problem, OPTIONS)
+    delays = np.zeros(len(problem.measurements))
+    delays[150] = 2e9
+    feed.all(delays)
+    assert feed.estimator.health().too_late == 1
+    feed.pose(len(problem.measurements) - 1)
+    assert feed.estimator.health().duplicates == 1
+
+
+def test_buffers_turn_over_and_nothing_grows():
+    options = replace(OPTIONS, graph=Graph(lag_s=0.4))
+    problem = simulated(options=options, duration_s=14.0)
+    whole = run_graph(problem, options)
+    feed = Feed(problem, options, ahead_s=0.1, max_imu_rate_hz=120.0, max_pose_rate_hz=50.0)
+    last = problem.imu.stamps_ns[-2]
+    states = feed.all(np.minimum(0.1e9, last - np.minimum(problem.measurements.stamps_ns, last)), last)
+    health = feed.estimator.health()
+    assert health.overflowed == health.too_late == 0
+    assert len(feed.estimator._kept) < 60
+    assert feed.estimator._samples < 400
+    assert_same_state(states[last], whole, 1e-9)
+
+
+def test_an_approximate_map_and_calibration_come_out_the_same():
+    options = replace(OPTIONS, estimate=Estimate(extrinsics=True, time_offset=True, map="approximate"))
+    problem = simulated(options=options, symmetric_objects=0)
+    whole = run_graph(problem, options)
+    last = problem.imu.stamps_ns[-2]
+    stamps = problem.measurements.stamps_ns
+    states = Feed(problem, options).all(np.minimum(0.05e9, np.maximum(last - stamps, 0)), last)
+    assert_same_state(states[last], whole, 1e-8)
