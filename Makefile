@@ -33,10 +33,12 @@ setup: .venv/test.stamp
 
 .venv/core.stamp: .venv/bin/python $(SOURCES)
 	$(PIP) --editable .
+	$(BIN)/poet-loc compile
 	touch $@
 
 .venv/test.stamp: .venv/bin/python $(SOURCES)
 	$(PIP) --editable ".[test]"
+	$(BIN)/poet-loc compile
 	touch $@ .venv/core.stamp
 
 .venv/docs.stamp: .venv/test.stamp

@@ -14,16 +14,8 @@ from fusion.compiled import njit
 from fusion.nav_state import Array, Ints
 from fusion.so3_kernels import apply, exp_so3, log_so3, multiply, multiply_transposed_left, multiply_transposed_right
 
-# A vote: where the detection puts the imu, where the integrated motion had it, and what the filter did with it.
-VOTE_ROTATION, VOTE_POSITION, MOTION_ROTATION, MOTION_POSITION, VOTE_USED, VOTE_DISTANCE, VOTE_SIZE = (
-    0,
-    9,
-    12,
-    21,
-    24,
-    25,
-    26,
-)
+# A vote: where the detection puts the imu, where the integrated motion had it, and how far away the object is.
+VOTE_ROTATION, VOTE_POSITION, MOTION_ROTATION, MOTION_POSITION, VOTE_DISTANCE, VOTE_SIZE = 0, 9, 12, 21, 24, 25
 
 # Places in the options of the start.
 (
@@ -126,15 +118,15 @@ def largest_agreement(
 ) -> tuple[int, float]:
     """Find the correction most votes agree on; write it to C (9,), d (3,), v (3,); return how many and their span (s).
 
-    votes is a ring whose entries first..head-1 (modulo its length) count; inlier (ring length) marks those that agree.
-    origin (6,) is the position and velocity that the correction replaces; v is fitted to the agreeing votes, so that at
-    stamp `now` position and velocity become d and v. scratch holds 96 floats.
+    votes is a ring whose entries first..head-1 (modulo its length, a power of two) count; inlier (ring length) marks
+    those that agree. origin (6,) is the position and velocity that the correction replaces; v is fitted to the agreeing
+    votes, so that at stamp `now` position and velocity become d and v. scratch holds 96 floats.
     """
-    capacity, best, best_i, cosine = len(stamps), 0, -1, math.cos(options[MAX_ANGLE])
+    mask, best, best_i, cosine = len(stamps) - 1, 0, -1, math.cos(options[MAX_ANGLE])
     for j in range(3):
         v[j] = 0.0
     for a in range(first, head):
-        i = a % capacity
+        i = a & mask
         _correction(votes, i, origin, gravity, (stamps[i] - now) * 1e-9, C, d)
         if _tilt(C, up) > options[MAX_TILT]:
             continue
@@ -149,7 +141,7 @@ def largest_agreement(
         _refine(votes, stamps, first, head, now, origin, gravity, options, cosine, C, d, v, inlier, scratch)
     count, oldest, newest = 0, now, stamps[best_i]
     for a in range(first, head):
-        j = a % capacity
+        j = a & mask
         if inlier[j]:
             count, oldest, newest = count + 1, min(oldest, stamps[j]), max(newest, stamps[j])
     return count, max(0.0, (newest - oldest) * 1e-9)
@@ -176,7 +168,7 @@ def _mark(
     """Mark and count the votes that agree with the correction of one of them, which knows no velocity yet."""
     count = 0
     for b in range(first, head):
-        j = b % len(stamps)
+        j = b & (len(stamps) - 1)
         reach = options[MAX_DISTANCE] + options[MAX_LEVER] * votes[j, VOTE_DISTANCE]
         reach += options[MAX_SPEED] * abs(stamps[seed] - stamps[j]) * 1e-9
         agrees = _agree(votes, j, C, d, v, origin, gravity, (stamps[j] - now) * 1e-9, cosine, reach, scratch)
@@ -203,12 +195,12 @@ def _refine(
     scratch: Array,
 ) -> None:
     """Average the agreeing votes' corrections, fit offset and velocity to them, and choose them anew."""
-    capacity = len(stamps)
+    mask = len(stamps) - 1
     vector, mean, turn, shift, other = scratch[48:51], scratch[51:54], scratch[54:63], scratch[63:66], scratch[66:75]
     count = 0
     mean[0] = mean[1] = mean[2] = 0.0
     for a in range(first, head):
-        i = a % capacity
+        i = a & mask
         if inlier[i]:
             multiply_transposed_right(votes[i, 0:9], votes[i, 12:21], other)
             multiply_transposed_left(C, other, turn)
@@ -227,7 +219,7 @@ def _refine(
     for j in range(3):
         sw, st, stt, sy, sty = 0.0, 0.0, ridge, 0.0, 0.0
         for a in range(first, head):
-            i = a % capacity
+            i = a & mask
             if inlier[i]:
                 t = (stamps[i] - now) * 1e-9
                 _shift(votes, i, C, origin, gravity, t, shift)
@@ -237,6 +229,6 @@ def _refine(
         d[j] = (stt * sy - st * sty) / determinant
         v[j] = (sw * sty - st * sy) / determinant
     for a in range(first, head):
-        i = a % capacity
+        i = a & mask
         reach = options[MAX_DISTANCE] + options[MAX_LEVER] * votes[i, VOTE_DISTANCE]
         inlier[i] = _agree(votes, i, C, d, v, origin, gravity, (stamps[i] - now) * 1e-9, cosine, reach, scratch)

@@ -133,7 +133,7 @@ def correct(
     error: Array,
     scratch: Array,
 ) -> None:
-    """Kalman update with rows first..first+size of a measurement: x and P in place."""
+    """Kalman update with rows first..first+size (size 3 or 6) of a measurement: x and P in place."""
     n = layout[N_ERROR]
     if not cholesky(S, first, size, L):
         return
@@ -152,10 +152,15 @@ def correct(
             Z[r, i] *= factor
             error[i] += Z[r, i] * white[r]
     for i in range(n):
-        for r in range(size):
-            factor = Z[r, i]
+        z0, z1, z2 = Z[0, i], Z[1, i], Z[2, i]
+        if size == 6:
+            z3, z4, z5 = Z[3, i], Z[4, i], Z[5, i]
             for j in range(n):
-                P[i, j] -= factor * Z[r, j]
+                total = z0 * Z[0, j] + z1 * Z[1, j] + z2 * Z[2, j]
+                P[i, j] -= total + (z3 * Z[3, j] + z4 * Z[4, j] + z5 * Z[5, j])
+        else:
+            for j in range(n):
+                P[i, j] -= z0 * Z[0, j] + z1 * Z[1, j] + z2 * Z[2, j]
     before = scratch[32:47]
     for i in range(15):
         before[i] = x[i]

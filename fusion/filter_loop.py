@@ -20,7 +20,6 @@ from fusion.consensus import (
     START_MIN_SPAN_S,
     START_WINDOW_S,
     VOTE_DISTANCE,
-    VOTE_USED,
     largest_agreement,
 )
 from fusion.eskf import (
@@ -467,7 +466,7 @@ def _vote(m: Memory, w: Work, kind: int, k: int, rotation: Array, translation: A
     """Remember where a measurement puts the imu. A symmetric object does not say which way it is turned: no vote."""
     if kind == OBJECT_POSE and (m.orders[k] != 1 or m.known[k] == 0.0 or status_of(m, kind, k) != ON_MAP):
         return
-    slot = m.counters[VOTE_HEAD] % len(m.vote_stamps)
+    slot = m.counters[VOTE_HEAD] & (len(m.vote_stamps) - 1)
     vote = m.votes[slot]
     R_wc, R_wi, lever, p_wc = w.step[0:9], vote[0:9], w.step[9:12], w.step[12:15]
     if kind == OBJECT_POSE:
@@ -491,7 +490,7 @@ def _vote(m: Memory, w: Work, kind: int, k: int, rotation: Array, translation: A
         vote[21 + i] = m.x[POSITION + i]
     for i in range(9):
         vote[12 + i] = m.x[i]
-    vote[VOTE_USED] = decision & POSITION_ONLY  # rotation alone does not hold the position
+    m.used[slot] = decision & POSITION_ONLY  # rotation alone does not hold the position
     vote[VOTE_DISTANCE] = distance
     m.vote_stamps[slot] = m.counters[NOW]
     m.counters[VOTE_HEAD] += 1
@@ -503,7 +502,7 @@ def _first_vote(m: Memory, window_s: float, wanted: int) -> int:
     head, capacity = m.counters[VOTE_HEAD], len(m.vote_stamps)
     first = head
     while first > 0 and head - first < capacity - 1:
-        age = (m.counters[NOW] - m.vote_stamps[(first - 1) % capacity]) * 1e-9
+        age = (m.counters[NOW] - m.vote_stamps[(first - 1) & (capacity - 1)]) * 1e-9
         if age > m.start[LONGEST_WINDOW_S] or (age > window_s and head - first >= wanted):
             break
         first -= 1
@@ -566,7 +565,7 @@ def _restart_if_lost(m: Memory, w: Work) -> None:
         return
     used = 0.0
     for a in range(first, head):
-        used += m.votes[a % len(m.vote_stamps), VOTE_USED]
+        used += m.used[a & (len(m.vote_stamps) - 1)]
     if used > m.start[LOST_SHARE] * (head - first):
         return
     m.up[0], m.up[1], m.up[2] = 0.0, 0.0, 1.0
@@ -609,20 +608,21 @@ def _adopt(m: Memory, w: Work, keep_from: int) -> None:
     # The agreeing votes count as used, so that a restart is not followed by the next at once.
     for a in range(len(m.inliers)):
         if m.inliers[a]:
-            m.votes[a, VOTE_USED] = 1.0
+            m.used[a] = 1.0
 
 
 @njit(cache=True)
 def emit(m: Memory, row: int, out_stamps: Ints, out_core: Array, out_sigma: Array, out_covariance: Array) -> None:
     """Write the state of now: core (21,), 1-sigma of its errors (15,), covariance of attitude and position (36,)."""
     out_stamps[row] = m.counters[NOW]
+    core, sigma, covariance, P = out_core[row], out_sigma[row], out_covariance[row], m.P
     for i in range(OUT_CORE):
-        out_core[row, i] = m.x[i]
+        core[i] = m.x[i]
     for i in range(OUT_SIGMA):
-        out_sigma[row, i] = math.sqrt(max(m.P[i, i], 0.0))
+        sigma[i] = math.sqrt(max(P[i, i], 0.0))
     for i in range(6):
         for j in range(6):
-            out_covariance[row, 6 * i + j] = m.P[i, j]
+            covariance[6 * i + j] = P[i, j]
     if len(m.tape) > 0:
         note_row(m, row)
 

@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
+from scipy.spatial.transform import RigidTransform
 
 from fusion import filter_loop, memory
 from fusion.calibrated import calibrated
@@ -20,7 +20,6 @@ from fusion.options import FuseOptions
 from fusion.place_watch import RELEASED
 from fusion.prepare import Problem, fill_memory, pose_problem
 from fusion.result import FuseResult, GateLog
-from poet_loc.core.geometry import make_pose
 from poet_loc.core.input_error import InputError
 from poet_loc.core.records import CameraPoses, ObjectPoses
 from poet_loc.io.log_folder import Log
@@ -149,11 +148,13 @@ def result_from_rows(
 ) -> FuseResult:
     """Turn rows (stamps, nominal core (N, 21), sigmas (N, 15), covariances (N, 6, 6)) into a result."""
     stamps, core, sigma, covariance = rows
-    rotation = Rotation.from_matrix(core[:, :9].reshape(-1, 3, 3))
+    T_world_imu = np.zeros((len(core), 4, 4))
+    T_world_imu[:, :3, :3], T_world_imu[:, :3, 3] = core[:, :9].reshape(-1, 3, 3), core[:, 9:12]
+    T_world_imu[:, 3, 3] = 1.0
     return FuseResult(
         name=name,
         stamps_ns=stamps,
-        T_world_imu=make_pose(rotation, core[:, 9:12]),
+        T_world_imu=RigidTransform(T_world_imu, normalize=False, copy=False),  # the filter's are rotations
         velocity=core[:, 12:15],
         gyroscope_bias=core[:, 15:18],
         accelerometer_bias=core[:, 18:21],

@@ -92,27 +92,28 @@ def _rows_times(
     blocks: Array, dt: float, gravity_basis: Array, at_gravity: int, P: Array, columns: int, scratch: Array
 ) -> None:
     """P[:15, :columns] <- F P[:15, :columns] for the core's transition F, in place (and gravity's two columns of F)."""
-    rate = scratch
+    rate, half = scratch, 0.5 * dt
     for i in range(3):
+        c0, c1, c2 = blocks[18 + 3 * i], blocks[19 + 3 * i], blocks[20 + 3 * i]
+        d0, d1, d2 = blocks[27 + 3 * i], blocks[28 + 3 * i], blocks[29 + 3 * i]
+        e0, e1, e2 = blocks[36 + 3 * i], blocks[37 + 3 * i], blocks[38 + 3 * i]
         for j in range(columns):
-            rate[i, j] = 0.0
-        for k in range(3):
-            c, d, e = blocks[18 + 3 * i + k], blocks[27 + 3 * i + k], blocks[36 + 3 * i + k]
-            for j in range(columns):
-                rate[i, j] += c * P[k, j] + d * P[GYRO_BIAS_ERROR + k, j] + e * P[ACCEL_BIAS_ERROR + k, j]
+            total = c0 * P[0, j] + c1 * P[1, j] + c2 * P[2, j]
+            total += d0 * P[9, j] + d1 * P[10, j] + d2 * P[11, j]
+            rate[i, j] = total + e0 * P[12, j] + e1 * P[13, j] + e2 * P[14, j]
         if at_gravity >= 0:
             first, second = dt * gravity_basis[2 * i], dt * gravity_basis[2 * i + 1]
             for j in range(columns):
                 rate[i, j] += first * P[at_gravity, j] + second * P[at_gravity + 1, j]
     for i in range(3):
         for j in range(columns):
-            P[POSITION_ERROR + i, j] += dt * P[VELOCITY_ERROR + i, j] + 0.5 * dt * rate[i, j]
+            P[POSITION_ERROR + i, j] += dt * P[VELOCITY_ERROR + i, j] + half * rate[i, j]
             P[VELOCITY_ERROR + i, j] += rate[i, j]
-            rate[i, j] = 0.0
-        for k in range(3):
-            a, b = blocks[3 * i + k], blocks[9 + 3 * i + k]
-            for j in range(columns):
-                rate[i, j] += a * P[k, j] + b * P[GYRO_BIAS_ERROR + k, j]
+    for i in range(3):
+        a0, a1, a2 = blocks[3 * i], blocks[3 * i + 1], blocks[3 * i + 2]
+        b0, b1, b2 = blocks[9 + 3 * i], blocks[10 + 3 * i], blocks[11 + 3 * i]
+        for j in range(columns):
+            rate[i, j] = a0 * P[0, j] + a1 * P[1, j] + a2 * P[2, j] + b0 * P[9, j] + b1 * P[10, j] + b2 * P[11, j]
     for i in range(3):
         for j in range(columns):
             P[i, j] = rate[i, j]
@@ -137,21 +138,18 @@ def propagate_covariance(
     """
     n, at_gravity = layout[N_ERROR], layout[AT_GRAVITY]
     _rows_times(blocks, dt, gravity_basis, at_gravity, P, n, scratch)
-    # F (P F^T): the core's columns are the transpose of the rows just made; gravity rows enter through theirs.
-    for i in range(CORE):
+    # (F P) F^T: the bias rows of F are identity, so that what is left is the block of attitude, position and velocity.
+    for i in range(GYRO_BIAS_ERROR):
         for j in range(CORE):
             core[j, i] = P[i, j]
-    if at_gravity >= 0:
-        for i in range(CORE):
+        if at_gravity >= 0:
             core[CORE, i] = P[i, at_gravity]
             core[CORE + 1, i] = P[i, at_gravity + 1]
-        _rows_times(blocks, dt, gravity_basis, CORE, core, CORE, scratch)
-    else:
-        _rows_times(blocks, dt, gravity_basis, -1, core, CORE, scratch)
-    for i in range(CORE):
-        for j in range(i, CORE):
+    _rows_times(blocks, dt, gravity_basis, CORE if at_gravity >= 0 else -1, core, GYRO_BIAS_ERROR, scratch)
+    for i in range(GYRO_BIAS_ERROR):
+        for j in range(i, GYRO_BIAS_ERROR):
             P[i, j] = P[j, i] = 0.5 * (core[i, j] + core[j, i])
-        for j in range(CORE, n):
+        for j in range(GYRO_BIAS_ERROR, n):
             P[j, i] = P[i, j]
     add_process_noise(P, dt, interval, noise)
 

@@ -120,7 +120,7 @@ def ray_aligned_covariance(
     return covariances
 
 
-@njit(cache=True, inline="always")
+@njit(cache=True)
 def write_bias_axes(p: Array, out: Array) -> None:
     """Write D(p), the (3, 3) derivative of a biased position by its translation bias, into out (9,)."""
     out[0], out[1], out[2] = p[2], 0.0, p[0]
@@ -371,14 +371,14 @@ def _object_pose(
         _put(H, 3, bias_start + 6 * bias + 3, 1.0, axes)
 
 
-@njit(cache=True, inline="always")
+@njit(cache=True)
 def _put(H: Array, row: int, column: int, sign: float, block: Array) -> None:
     for i in range(3):
         for j in range(3):
             H[row + i, column + j] = sign * block[3 * i + j]
 
 
-@njit(cache=True, inline="always")
+@njit(cache=True)
 def _transposed_times_skew(a: Array, v: Array, out: Array) -> None:
     for i in range(3):
         out[3 * i] = a[3 + i] * v[2] - a[6 + i] * v[1]

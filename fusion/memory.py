@@ -16,7 +16,7 @@ from fusion.nav_state import CORE, LAYOUT_SIZE, StateLayout
 Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
-VOTES = 256  # a second of eight objects at 30 Hz
+VOTES = 256  # a second of eight objects at 30 Hz; a power of two, so that places are found without a division
 
 # Counters, part of what a snapshot keeps.
 (
@@ -58,6 +58,7 @@ TALLY_SIZE, PLACE_SIZE = 8, 15  # rows of tallies and places, see place_watch.py
     AT_PRIOR,
     AT_WORK,
     AT_VOTES,
+    AT_USED,
     H_N,
     H_NX,
     H_K,
@@ -70,7 +71,7 @@ TALLY_SIZE, PLACE_SIZE = 8, 15  # rows of tallies and places, see place_watch.py
     AT_TAPE,
     TAPE_SIZE,
     HEADER,
-) = range(30)
+) = range(31)
 
 
 class Memory(NamedTuple):
@@ -93,6 +94,7 @@ class Memory(NamedTuple):
     prior: Array  # (n,) 1-sigma of the error state at the start
     work: Array
     votes: Array
+    used: Array  # (VOTES,) 1 where the filter took a vote's position in
     tape: Array  # what the smoother needs of it (`fusion/tape.py`); empty where nobody asks
     layout: Ints
     counters: Ints
@@ -126,6 +128,7 @@ def allocate(layout: StateLayout) -> tuple[Array, Ints]:
         (AT_PRIOR, n),
         (AT_WORK, work_size(n)),
         (AT_VOTES, VOTES * VOTE_SIZE),
+        (AT_USED, VOTES),
     )
     at = 0
     for name, size in sizes:
@@ -176,7 +179,7 @@ def work_size(n: int) -> int:
     )
 
 
-@njit(cache=True)
+@njit(cache=True, _nrt=True)
 def views(floats: Array, integers: Ints) -> Memory:
     """Return the parts of the two buffers by name."""
     n, nx, K = integers[H_N], integers[H_NX], max(integers[H_K], 1)
@@ -200,6 +203,7 @@ def views(floats: Array, integers: Ints) -> Memory:
         f[i[AT_PRIOR] : i[AT_PRIOR] + n],
         f[i[AT_WORK] : i[AT_WORK] + work_size(n)],
         f[i[AT_VOTES] : i[AT_VOTES] + VOTES * VOTE_SIZE].reshape((VOTES, VOTE_SIZE)),
+        f[i[AT_USED] : i[AT_USED] + VOTES],
         f[i[AT_TAPE] : i[AT_TAPE] + i[TAPE_SIZE]],
         i[i[AT_LAYOUT] : i[AT_LAYOUT] + LAYOUT_SIZE],
         i[i[AT_COUNTERS] : i[AT_COUNTERS] + N_COUNTERS],
@@ -232,7 +236,7 @@ class Work(NamedTuple):
     objects: Array  # (6 n + 36,)
 
 
-@njit(cache=True)
+@njit(cache=True, _nrt=True)
 def work_views(work: Array, n: int) -> Work:
     """Return the parts of the work space by name."""
     a = 256

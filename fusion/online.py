@@ -52,6 +52,7 @@ from poet_loc.core.input_error import InputError
 from poet_loc.core.records import Calibration, ImuSamples, LandmarkMap
 
 Array = NDArray[np.float64]
+_NO_OBJECT = np.array([-1])
 
 
 @dataclass(frozen=True)
@@ -211,9 +212,10 @@ class Estimator:
         usable = (landmarks >= 0) & ~(t[:, 2] <= NEAREST_OBJECT)
         self._not_in_map += int(len(ids) - np.count_nonzero(usable))
         R = self._detection_covariances(t, covariances)
-        rotations = Rotation.from_quat(np.asarray(q_xyzw, dtype=float).reshape(len(ids), 4)).as_matrix()
-        rows = np.flatnonzero(usable)
-        self._feed_poses(stamp_ns, OBJECT_POSE, landmarks[rows], rotations[rows], t[rows], R[rows])
+        q = np.asarray(q_xyzw, dtype=float).reshape(len(ids), 4)
+        if not usable.all():
+            landmarks, q, t, R = landmarks[usable], q[usable], t[usable], R[usable]
+        self._feed_poses(stamp_ns, OBJECT_POSE, landmarks, q, t, R)
 
     def feed_camera_pose(
         self, stamp_ns: SupportsIndex, position: ArrayLike, q_xyzw: ArrayLike, covariance: ArrayLike | None = None
@@ -224,8 +226,8 @@ class Estimator:
         with R = R_true Exp(e_r), t = t_true + e_t (None: from the options). Raises ValueError for a zero quaternion.
         """
         R = self._camera_covariance if covariance is None else np.asarray(covariance, dtype=float)
-        rotation = Rotation.from_quat(np.asarray(q_xyzw, dtype=float)).as_matrix()
-        self._feed_poses(stamp_ns, CAMERA_POSE, np.array([-1]), rotation, np.asarray(position, dtype=float), R)
+        q, t = np.asarray(q_xyzw, dtype=float).reshape(1, 4), np.asarray(position, dtype=float).reshape(1, 3)
+        self._feed_poses(stamp_ns, CAMERA_POSE, _NO_OBJECT, q, t, R.reshape(1, 6, 6))
 
     def feed_odometry(self, stamp_ns: SupportsIndex, position: ArrayLike, q_xyzw: ArrayLike) -> None:
         """Take in a camera pose T_odom_cam of odometry, of which only the motion since earlier ones is used.
@@ -306,24 +308,28 @@ class Estimator:
     def _detection_covariances(self, t: Array, covariances: ArrayLike | None) -> Array:
         noise, places = self.options.noise, np.where(np.isfinite(t), t, 1.0)
         sigma = math.radians(noise.rotation_deg)
+        if covariances is None:
+            return ray_aligned_covariance(places, noise.across, noise.along, sigma, noise.floor)
+        given = np.asarray(covariances, dtype=float).reshape(len(t), 6, 6)
+        stated = np.isfinite(given).all(axis=(1, 2))
+        if stated.all():
+            return given
         R = ray_aligned_covariance(places, noise.across, noise.along, sigma, noise.floor)
-        if covariances is not None:
-            given = np.asarray(covariances, dtype=float).reshape(R.shape)
-            stated = np.isfinite(given).all(axis=(1, 2))
-            R[stated] = given[stated]
+        R[stated] = given[stated]
         return R
 
     def _feed_poses(
-        self, stamp_ns: SupportsIndex, kind: int, landmarks: NDArray[np.int64], R_m: Array, t_m: Array, R: Array
+        self, stamp_ns: SupportsIndex, kind: int, landmarks: NDArray[np.int64], q: Array, t_m: Array, R: Array
     ) -> None:
         stamp, r = operator.index(stamp_ns) + self._shift_ns, self._ring
+        if not (q != 0.0).any(axis=1).all():
+            raise ValueError("a quaternion is zero")
         for first in range(0, len(landmarks), replay_memory.BATCH):
             rows = slice(first, first + replay_memory.BATCH)
             n = len(landmarks[rows])
             r.new_kinds[:n], r.new_objects[:n] = kind, landmarks[rows]
-            r.new_rotations[:n] = R_m.reshape(-1, 9)[rows]
-            r.new_translations[:n] = t_m.reshape(-1, 3)[rows]
-            r.new_covariances[:n] = R.reshape(-1, 6, 6)[rows]
+            r.new_rotations[:n, :4] = q[rows]
+            r.new_translations[:n], r.new_covariances[:n] = t_m[rows], R[rows]
             self._feed(replay.POSES, stamp, n)
 
     def _feed(self, what: int, stamp: int, count: int) -> None:

@@ -11,7 +11,6 @@ from __future__ import annotations
 import math
 
 from fusion.compiled import njit
-from fusion.consensus import VOTE_USED
 from fusion.filter_loop import advance, angular_velocity_at, begin, measure
 from fusion.memory import IMU_AT, N_COUNTERS, NOW, VOTE_HEAD, VOTES, Memory, Work, views, work_views
 from fusion.nav_state import N_ERROR, Array, Ints
@@ -39,6 +38,7 @@ from fusion.replay_memory import (
     Ring,
     ring_views,
 )
+from fusion.so3_kernels import from_quaternion
 
 IMU_SAMPLE, POSES = 0, 1
 
@@ -112,6 +112,7 @@ def _put_poses(r: Ring, stamp: int, n: int, in_the_past: bool) -> bool:
 @njit(cache=True)
 def _put_pose(r: Ring, stamp: int, i: int) -> bool:
     h = r.header
+    from_quaternion(r.new_rotations[i], r.new_rotations[i])
     if not _finite(r, i):
         h[MALFORMED] += 1
         return False
@@ -226,11 +227,11 @@ def _take_snapshot(m: Memory, r: Ring, floats: Array) -> None:
         h[FIRST_SNAPSHOT] += 1
     s = h[END_SNAPSHOT] % h[SNAPSHOTS]
     h[END_SNAPSHOT] += 1
-    state, used = r.snapshot_states[s], r.snapshot_used[s]
-    for i in range(h[STATE_SIZE]):
+    state, used, size = r.snapshot_states[s], r.snapshot_used[s], h[STATE_SIZE]
+    for i in range(size):
         state[i] = floats[i]
     for i in range(VOTES):
-        used[i] = m.votes[i, VOTE_USED]
+        used[i] = m.used[i]
     for i in range(N_COUNTERS):
         r.snapshot_counters[s, i] = m.counters[i]
 
@@ -256,7 +257,7 @@ def _rewind(m: Memory, r: Ring, floats: Array, stamp: int) -> None:
         m.votes[vote % VOTES] = r.overwritten[vote % h[CAPACITY]]
         m.vote_stamps[vote % VOTES] = r.overwritten_stamps[vote % h[CAPACITY]]
     for i in range(VOTES):  # a restart marks old votes as used, so marks are kept beside the votes
-        m.votes[i, VOTE_USED] = r.snapshot_used[s, i]
+        m.used[i] = r.snapshot_used[s, i]
     h[NEXT] = h[COUNT]
     while h[NEXT] > 0 and r.stamps[h[NEXT] - 1] > m.counters[NOW]:
         h[NEXT] -= 1

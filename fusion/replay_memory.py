@@ -63,7 +63,7 @@ class Ring(NamedTuple):
     rate: Array  # (3,) angular velocity at a measurement
     new_kinds: Ints  # (BATCH,) incoming measurements
     new_objects: Ints
-    new_rotations: Array
+    new_rotations: Array  # (BATCH, 9), a quaternion (scalar last) in the first four places
     new_translations: Array
     new_covariances: Array
 
@@ -83,7 +83,7 @@ def allocate_ring(
     return ring_floats, ring_integers
 
 
-@njit(cache=True)
+@njit(cache=True, _nrt=True)
 def ring_views(f: Array, i: Ints) -> Ring:
     """Return the parts of the two arrays by name."""
     ci, cm, s, size = i[IMU_CAPACITY], i[CAPACITY], i[SNAPSHOTS], i[STATE_SIZE]

@@ -17,7 +17,7 @@ Array = NDArray[np.float64]
 _SMALL = 1e-4
 
 
-@njit(cache=True, inline="always")
+@njit(cache=True)
 def exp_so3(vx: float, vy: float, vz: float, out: Array) -> None:
     """Write Exp of a rotation vector (rad) into out (9,)."""
     angle2 = vx * vx + vy * vy + vz * vz
@@ -37,6 +37,16 @@ def exp_so3(vx: float, vy: float, vz: float, out: Array) -> None:
     out[6] = second * vx * vz - first * vy
     out[7] = second * vy * vz + first * vx
     out[8] = 1.0 - second * (vx * vx + vy * vy)
+
+
+@njit(cache=True)
+def from_quaternion(q: Array, out: Array) -> None:
+    """Write the matrix of a quaternion q (4 or more, scalar last), of any norm but 0, into out (9,), which may be q."""
+    x, y, z, w = q[0], q[1], q[2], q[3]
+    twice = 2.0 / (x * x + y * y + z * z + w * w)
+    out[0], out[1], out[2] = 1.0 - twice * (y * y + z * z), twice * (x * y - z * w), twice * (x * z + y * w)
+    out[3], out[4], out[5] = twice * (x * y + z * w), 1.0 - twice * (x * x + z * z), twice * (y * z - x * w)
+    out[6], out[7], out[8] = twice * (x * z - y * w), twice * (y * z + x * w), 1.0 - twice * (x * x + y * y)
 
 
 @njit(cache=True)
@@ -64,7 +74,7 @@ def log_so3(m: Array, out: Array) -> None:
     out[0], out[1], out[2] = factor * x, factor * y, factor * z
 
 
-@njit(cache=True, inline="always")
+@njit(cache=True)
 def left_jacobian(vx: float, vy: float, vz: float, sign: float, out: Array) -> None:
     """Write J_l(sign * v) into out (9,); sign -1 gives the right Jacobian of v."""
     vx, vy, vz = sign * vx, sign * vy, sign * vz
@@ -79,7 +89,7 @@ def left_jacobian(vx: float, vy: float, vz: float, sign: float, out: Array) -> N
     _identity_plus(vx, vy, vz, first, second, out)
 
 
-@njit(cache=True, inline="always")
+@njit(cache=True)
 def left_jacobian_inverse(vx: float, vy: float, vz: float, sign: float, out: Array) -> None:
     """Write the inverse of J_l(sign * v) into out (9,); sign -1 gives that of the right Jacobian."""
     vx, vy, vz = sign * vx, sign * vy, sign * vz
@@ -92,7 +102,7 @@ def left_jacobian_inverse(vx: float, vy: float, vz: float, sign: float, out: Arr
     _identity_plus(vx, vy, vz, -0.5, second, out)
 
 
-@njit(cache=True, inline="always")
+@njit(cache=True)
 def _identity_plus(vx: float, vy: float, vz: float, first: float, second: float, out: Array) -> None:
     """Write I + first [v]x + second [v]x^2 into out (9,)."""
     out[0] = 1.0 - second * (vy * vy + vz * vz)
@@ -106,7 +116,7 @@ def _identity_plus(vx: float, vy: float, vz: float, first: float, second: float,
     out[8] = 1.0 - second * (vx * vx + vy * vy)
 
 
-@njit(cache=True, inline="always")
+@njit(cache=True)
 def multiply(a: Array, b: Array, out: Array) -> None:
     """Write a @ b into out (9,); out is neither a nor b."""
     for i in range(3):
@@ -114,7 +124,7 @@ def multiply(a: Array, b: Array, out: Array) -> None:
             out[3 * i + j] = a[3 * i] * b[j] + a[3 * i + 1] * b[3 + j] + a[3 * i + 2] * b[6 + j]
 
 
-@njit(cache=True, inline="always")
+@njit(cache=True)
 def multiply_transposed_left(a: Array, b: Array, out: Array) -> None:
     """Write a^T @ b into out (9,); out is neither a nor b."""
     for i in range(3):
@@ -122,7 +132,7 @@ def multiply_transposed_left(a: Array, b: Array, out: Array) -> None:
             out[3 * i + j] = a[i] * b[j] + a[3 + i] * b[3 + j] + a[6 + i] * b[6 + j]
 
 
-@njit(cache=True, inline="always")
+@njit(cache=True)
 def multiply_transposed_right(a: Array, b: Array, out: Array) -> None:
     """Write a @ b^T into out (9,); out is neither a nor b."""
     for i in range(3):
@@ -130,21 +140,21 @@ def multiply_transposed_right(a: Array, b: Array, out: Array) -> None:
             out[3 * i + j] = a[3 * i] * b[3 * j] + a[3 * i + 1] * b[3 * j + 1] + a[3 * i + 2] * b[3 * j + 2]
 
 
-@njit(cache=True, inline="always")
+@njit(cache=True)
 def apply(a: Array, x: float, y: float, z: float, out: Array) -> None:
     """Write a @ (x, y, z) into out (3,)."""
     for i in range(3):
         out[i] = a[3 * i] * x + a[3 * i + 1] * y + a[3 * i + 2] * z
 
 
-@njit(cache=True, inline="always")
+@njit(cache=True)
 def apply_transposed(a: Array, x: float, y: float, z: float, out: Array) -> None:
     """Write a^T @ (x, y, z) into out (3,)."""
     for i in range(3):
         out[i] = a[i] * x + a[3 + i] * y + a[6 + i] * z
 
 
-@njit(cache=True, inline="always")
+@njit(cache=True)
 def times_skew(a: Array, x: float, y: float, z: float, out: Array) -> None:
     """Write a @ skew(x, y, z) into out (9,)."""
     for i in range(3):

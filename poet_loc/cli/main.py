@@ -31,6 +31,7 @@ COMMANDS = {
     "evaluate-poses": "object poses against the truth: ADD, ADD-S, their areas, BOP recalls, per class",
     "table": "the localisation table of one log or several: detections x modes",
     "check": "say what looks wrong in a log: units, stamps, conventions, extrinsics, map",
+    "compile": "compile the filter once, so that the first run does not wait",
     "convert": "bring data from other formats into a log folder",
     "model-card": "figures of a checkpoint on rendered test videos",
     "render": "images or videos of the rendered household world",

@@ -101,7 +101,9 @@ def _summaries(arguments: Arguments) -> list[Summary]:
     seeds = range(first, first + arguments.runs)
     if arguments.cluster is None:
         return simulate_runs(function, seeds, arguments.workers)
-    from distributed import Client
-
+    try:
+        from distributed import Client
+    except ImportError:
+        raise InputError("a cluster needs dask.distributed", fix="pip install 'poet-loc[cluster]'") from None
     with Client(arguments.cluster) as client:  # type: ignore[no-untyped-call]
         return simulate_runs(function, seeds, client=client)

@@ -63,6 +63,7 @@ def assert_ends_like(estimator: Estimator, problem: Problem, options: FuseOption
     np.testing.assert_allclose(estimator.memory.votes, whole.memory.votes, rtol=tolerance, atol=tolerance)
     np.testing.assert_allclose(estimator.memory.tallies, whole.memory.tallies, rtol=1e-7)
     np.testing.assert_allclose(estimator.memory.places, whole.memory.places, rtol=1e-7, atol=1e-9)
+    np.testing.assert_array_equal(estimator.memory.used, whole.memory.used)
 
 
 def shuffled(problem: Problem, lateness_s: float, rng: np.random.Generator) -> list[tuple[int, int, int]]:
