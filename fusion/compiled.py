@@ -50,16 +50,18 @@ def kernels_from_scratch() -> int:
 
 
 def _counting_where_it_must(dispatcher: Any) -> Any:
-    """Let a dispatcher count references after all where numba finds that it must: for copies from array to array."""
+    """Let a dispatcher count references after all where numba finds that it must: for copies, for a new array."""
     compile_without = dispatcher.compile
 
     def compile_with_or_without(signature: Any) -> Any:
         try:
             return compile_without(signature)
         except NumbaError as error:
-            if dispatcher.targetoptions["_nrt"] or "NRT required" not in str(error):
+            must = any(words in str(error) for words in ("NRT required", "Only accept return"))
+            if dispatcher.targetoptions["_nrt"] or not must:
                 raise
             dispatcher.targetoptions["_nrt"] = True
+            dispatcher._compiler._failed_cache.clear()
             return compile_without(signature)
 
     dispatcher.compile = compile_with_or_without

@@ -67,6 +67,11 @@ def copied(x, out):
     out[:3] = x[:3]  # numba makes a copy in between where the two may overlap
 
 
+@njit
+def doubled(x):
+    return x + x
+
+
 class Halves(NamedTuple):
     first: np.ndarray
     second: np.ndarray
@@ -96,6 +101,8 @@ def test_a_kernel_inside_a_kernel_gives_what_it_gives_python():
     @njit
     def outer(x, out):
         copied(x, out)
+        parts = halves(doubled(out))
+        out[0:2] = 0.5 * parts.first
         parts = halves(out)
         parts.first[0] = power(parts.second[0], 2)
 
@@ -108,7 +115,7 @@ def test_a_kernel_inside_a_kernel_gives_what_it_gives_python():
     np.testing.assert_array_equal(out, [4.0, 1.0, 2.0, 0.0])
     assert power(3.0, 2) == 9.0
     copied(x, out)
-    np.testing.assert_array_equal(out, [0.0, 1.0, 2.0, 0.0])
+    np.testing.assert_array_equal(doubled(out), [0.0, 2.0, 4.0, 0.0])
 
 
 def test_a_kernel_that_returns_arrays_must_say_so():
