@@ -17,9 +17,8 @@ from poet_loc.core.records import ObjectPoses
 from poet_loc.data.packed import ObjectModels, load_models
 from poet_loc.io.bop import BopScene, read_bop_scene
 from poet_loc.io.frames_csv import read_frames
-from poet_loc.model.checkpoint import ModelConfig, load_model
+from poet_loc.model.checkpoint import load_model
 from poet_loc.model.embedded import EMBEDDED_WEIGHTS
-from poet_loc.model.poet import PoET
 from poet_loc.train.average_precision import mean_average_precision
 from poet_loc.train.embedded import Boxes
 from poet_loc.train.video_poses import VideoPoses, poses_of_video, true_boxes
@@ -39,6 +38,8 @@ class MeasureOptions:
     """Write object_poses_bb.csv and object_poses_gt.csv into the videos' folders, objects of the map alone."""
     least_visible: float = 0.1
     """Objects less visible than this share are not asked for."""
+    jobs: int = 1
+    """Processes."""
     progress: bool = True
     """Show a progress bar."""
 
@@ -81,13 +82,12 @@ def measure(options: MeasureOptions) -> Figures:
     folders = sorted(path.parent for path in options.videos.glob("*/frames.csv"))
     if not folders:
         raise InputError("has no rendered videos", path=options.videos, fix="poet-loc render videos --out FOLDER")
-    network, config = load_model(options.weights)
     models = load_models(options.videos / "models")
     names = {int(k): v for k, v in json.loads((options.videos / "models" / "names.json").read_text()).items()}
     parts: dict[Boxes, list[PoseScores]] = {"bb": [], "gt": []}
     detections: list[Array] = []
     truth: list[Array] = []
-    for folder, found in _with_bar(network, config, folders, options.progress):
+    for folder, found in _poses_of_videos(options, folders):
         scene, frames = read_bop_scene(folder), read_frames(folder / "frames.csv")
         for kind, poses in found.poses.items():
             parts[kind].append(score_poses(poses, scene, models, options.least_visible))
@@ -107,15 +107,21 @@ def measure(options: MeasureOptions) -> Figures:
     )
 
 
-def _with_bar(
-    network: PoET, config: ModelConfig, folders: Sequence[Path], visible: bool
-) -> Iterator[tuple[Path, VideoPoses]]:
+def _poses_of_videos(options: MeasureOptions, folders: Sequence[Path]) -> Iterator[tuple[Path, VideoPoses]]:
+    from joblib import Parallel, delayed
+
     from poet_loc.data.render import progress_bar
 
-    with progress_bar("measuring", "videos", len(folders), visible) as advance:
-        for folder in folders:
-            yield folder, poses_of_video(network, config, folder)
+    workers = Parallel(n_jobs=options.jobs, return_as="generator")
+    found = workers(delayed(_poses_of)(options.weights, folder) for folder in folders)
+    with progress_bar("measuring", "videos", len(folders), options.progress) as advance:
+        for folder, poses in zip(folders, found, strict=True):
+            yield folder, poses
             advance(1)
+
+
+def _poses_of(weights: Path, folder: Path) -> VideoPoses:
+    return poses_of_video(*load_model(weights), folder)
 
 
 def _boxes_with_class(scene: BopScene, row: int, least_visible: float) -> Array:
