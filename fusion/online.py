@@ -245,8 +245,9 @@ class Estimator:
         if seconds <= 0.0 or (self._odometry is not None and seconds < self.options.odometry.step_s - 1e-6):
             return
         refused, spread = self._refused(), seconds * odometry_spread(self.options)
-        moved = R_then.T @ R, R_then.T @ (t - t_then)
-        self._feed_poses(stamp, ODOMETRY_STEP, np.array([BEFORE_POSES]), *moved, spread)
+        turned = Rotation.from_matrix(R_then.T @ R).as_quat().reshape(1, 4)
+        moved = turned, (R_then.T @ (t - t_then)).reshape(1, 3), spread.reshape(1, 6, 6)
+        self._feed_poses(stamp, ODOMETRY_STEP, np.array([BEFORE_POSES]), *moved)
         if self._refused() == refused:  # else the next one is measured against the same pose as this
             self._odometry = stamp, R, t
 
