@@ -42,7 +42,7 @@ def motion_source(
     """
     kind = options.motion
     if kind == "auto":
-        kind = "imu" if log.imu is not None else "odometry" if log.T_odom_cam is not None else "constant-velocity"
+        kind = _best_of(log, options)
     if kind == "imu+odometry":
         _odometry_of(log)
         return replace(_imu(log, calibration, options), kind=kind)
@@ -55,6 +55,13 @@ def motion_source(
         samples = odometry_samples(T_odom_cam, T_cam_body)
         return MotionSource("odometry", samples, ImuNoise(0.0, 0.0, 0.0, 0.0, 0.0), body)
     return MotionSource("constant-velocity", _nothing_measured(stamps_ns, options), _smooth(options), body)
+
+
+def _best_of(log: Log, options: FuseOptions) -> Kind:
+    odometry = log.T_odom_cam is not None and len(log.T_odom_cam) > 1
+    if log.imu is not None:
+        return "imu+odometry" if odometry and options.estimator == "eskf" else "imu"
+    return "odometry" if odometry else "constant-velocity"
 
 
 def odometry_steps(log: Log, calibration: Calibration, options: FuseOptions) -> Measurements:

@@ -100,7 +100,7 @@ def estimate_log(
     if not localized and not fused:
         raise attempt.last or InputError("nothing can be estimated of this log", path=log.path)
     attempt.tell()
-    if fused and fused[0].motion != "imu" and options.fusion.motion == "auto":
+    if fused and log.imu is None and options.fusion.motion == "auto":
         report.note(f"{log.path}: no imu.csv: fused on {fused[0].motion.replace('-', ' ')} instead")
     for result in fused:
         _tell_of_moved_objects(log, result, report)

@@ -95,7 +95,9 @@ def test_a_log_without_imu_is_fused(log, motion):
 
 
 def test_auto_takes_the_best_there_is_and_says_so(log):
-    assert fuse(log).motion == "imu"
+    assert fuse(log).motion == "imu+odometry"
+    assert fuse(log, FuseOptions(estimator="graph")).motion == "imu"
+    assert fuse(replace(log, T_odom_cam=None)).motion == "imu"
     assert fuse(replace(log, imu=None)).motion == "odometry"
     assert fuse(replace(log, imu=None, T_odom_cam=None)).motion == "constant-velocity"
     with pytest.raises(InputError, match=r"imu\.csv"):
