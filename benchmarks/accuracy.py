@@ -62,7 +62,7 @@ def odometry(asked: argparse.Namespace) -> None:
 
 
 def euroc(asked: argparse.Namespace) -> None:
-    """A real IMU, with its printed densities and with ten times them."""
+    """A real IMU, with its printed densities and with ten times them (aloft it is noisier than on the bench)."""
     log = str(asked.shared / "euroc_v101")
     for scale in ("1", "10"):
         command("table", log, "--modes", "best", "robust", "--with-fusion", "--fusions", *FUSIONS, *noise_scale(scale))
@@ -171,7 +171,7 @@ def table_of(asked: argparse.Namespace, logs: tuple[str, ...], *options: str) ->
 
 
 def noise_scale(scale: str) -> list[str]:
-    return [] if scale == "1" else ["--options.fusion.imu-noise-scale", scale]
+    return [] if scale == "1" else ["--options.fusion.imu.noise-scale", scale, "--options.fusion.imu.walk-scale", scale]
 
 
 def command(*words: str) -> None:
@@ -195,7 +195,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("tables", nargs="*", choices=[*TABLES, []], help="default: all of them")
     parser.add_argument("--runs", type=int, default=50, help="seeds of a simulated table")
-    parser.add_argument("--shared", type=Path, default=Path(__file__).resolve().parents[2] / "shared" / "data")
+    parser.add_argument("--shared", type=Path, default=Path("../shared/data"))
     asked = parser.parse_args()
     for name in asked.tables or TABLES:
         print(f"\n## {TABLES[name].__doc__}")
