@@ -58,7 +58,7 @@ def real(asked: argparse.Namespace) -> None:
 
 def odometry(asked: argparse.Namespace) -> None:
     """The same with the real visual odometry as the source of motion."""
-    table_of(asked, TEST_LOGS, "--fusions", "eskf/objects", "graph/objects", "--options.fusion.motion", "odometry")
+    table_of(asked, TEST_LOGS, "--fusions", "eskf/objects", "graph/objects", "--fusion.motion", "odometry")
 
 
 def euroc(asked: argparse.Namespace) -> None:
@@ -171,7 +171,7 @@ def table_of(asked: argparse.Namespace, logs: tuple[str, ...], *options: str) ->
 
 
 def noise_scale(scale: str) -> list[str]:
-    return [] if scale == "1" else ["--options.fusion.imu.noise-scale", scale, "--options.fusion.imu.walk-scale", scale]
+    return [] if scale == "1" else ["--fusion.imu.noise-scale", scale, "--fusion.imu.walk-scale", scale]
 
 
 def command(*words: str) -> None:
