@@ -17,7 +17,7 @@ NETWORK = ("poet_loc.model", "poet_loc.data", "poet_loc.train", "poet_loc.detect
 MAY_IMPORT = {
     "poet_loc.core": (),
     "poet_loc.io": (),
-    "poet_loc.report": ("poet_loc.io",),
+    "poet_loc.report": ("poet_loc.io", "poet_loc.data.world.rasterizer"),
     **dict.fromkeys(NETWORK, ("poet_loc.io", *NETWORK)),
     "poet_loc.check": ("poet_loc.io", "landmarks"),
     "poet_loc.cli": OURS,

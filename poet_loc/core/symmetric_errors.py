@@ -18,7 +18,7 @@ Array = NDArray[np.float64]
 AxisAndPoint = tuple[tuple[float, float, float], tuple[float, float, float]]
 
 RECALL_SHARES = tuple(np.round(np.arange(0.05, 0.51, 0.05), 2).tolist())
-"""Thresholds of MSSD, in shares of the diameter (H, section 2.3)."""
+"""Thresholds of MSSD and tolerances of VSD in shares of the diameter, and thresholds of VSD (H, section 2.3)."""
 RECALL_PIXELS = tuple(range(5, 51, 5))
 """Thresholds of MSPD, in pixels of an image 640 px wide (H, section 2.3)."""
 
@@ -108,18 +108,20 @@ def average_recall(errors: ArrayLike, thresholds: Sequence[float], total: int) -
     return float(100.0 * np.mean([np.count_nonzero(errors < threshold) / total for threshold in thresholds]))
 
 
-def vsd(depth_est: Array, depth_ref: Array, depth_scene: Array, tau: float, delta: float = 0.015) -> float:
-    """Return the visible surface discrepancy of one pose from distance images (h, w) in m, 0 where nothing is.
+def vsd(distance_est: Array, distance_ref: Array, distance_scene: Array, tau: ArrayLike, delta: float = 0.015) -> Array:
+    """Return the visible surface discrepancy of one pose from distance images (h, w), for each tolerance (T,) -> (T,).
 
-    depth_est, depth_ref: the model alone, rendered in both poses; depth_scene: what the camera saw (H, eq. 1).
-    tau: tolerance of the distance, m; delta: how far behind the scene's surface a point still counts as visible.
+    Distances from the camera's centre in m, 0 where nothing is: the model alone in both poses, and what the camera saw.
+    tau: tolerances of the distance, m; delta: how far behind the scene's surface a point still counts as visible, m
+    (H, eq. 1; where the scene's distance is unknown the model counts as visible, as in the benchmark since 2019).
     """
-    scene = np.where(depth_scene > 0, depth_scene, np.inf)
-    visible_ref = (depth_ref > 0) & (depth_ref - scene <= delta)
-    visible_est = (depth_est > 0) & ((depth_est - scene <= delta) | (visible_ref & (depth_est > 0)))
-    union = visible_ref | visible_est
-    if not union.any():
-        return 1.0
+    scene = np.where(distance_scene > 0, distance_scene, np.inf)
+    visible_ref = (distance_ref > 0) & (distance_ref - scene <= delta)
+    visible_est = (distance_est > 0) & ((distance_est - scene <= delta) | visible_ref)
+    union = np.count_nonzero(visible_ref | visible_est)
+    if union == 0:
+        return np.ones(np.shape(tau))
     both = visible_ref & visible_est
-    close = np.abs(depth_est - depth_ref) < tau
-    return float(1.0 - np.count_nonzero(both & close) / np.count_nonzero(union))
+    gap = np.abs(distance_est[both] - distance_ref[both])
+    close = np.count_nonzero(gap[:, None] < np.reshape(tau, -1), axis=0).reshape(np.shape(tau))
+    return np.asarray(1.0 - close / union)

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from poet_loc.core.input_error import InputError
 from poet_loc.io.bop import read_bop_scene
 from poet_loc.io.bop_models import read_models_info
+from poet_loc.io.ply import read_model_mesh
 
 Array = NDArray[np.float64]
 
@@ -93,7 +94,7 @@ def load_models(folder: Path, count: int = 400) -> ObjectModels:
         raise InputError(f"objects {ids} are not numbered 1..{len(ids)}", path=folder / "models_info.json")
     points, surface, axes = [], [], np.zeros((len(ids), 3))
     for number in ids:
-        vertices, faces = _read_ply(folder / f"obj_{number:06d}.ply")
+        vertices, faces = read_model_mesh(folder / f"obj_{number:06d}.ply")
         surface.append(_spread_over(vertices, faces, 1000, np.random.default_rng(number)))
         points.append(vertices[np.linspace(0, len(vertices) - 1, count).astype(int)])
         symmetry = info[number].symmetry
@@ -103,16 +104,7 @@ def load_models(folder: Path, count: int = 400) -> ObjectModels:
     return ObjectModels(np.stack(points), np.stack(surface), diameters, axes)
 
 
-def _read_ply(path: Path) -> tuple[Array, NDArray[np.int64]]:
-    """Return vertices (V, 3) in m and triangles (F, 3) of an ASCII PLY in mm."""
-    lines = path.read_text().splitlines()
-    start = lines.index("end_header") + 1
-    count = next(int(line.split()[2]) for line in lines if line.startswith("element vertex"))
-    vertices = np.array([line.split()[:3] for line in lines[start : start + count]], float) / 1e3
-    return vertices, np.array([line.split()[1:4] for line in lines[start + count :]], int)
-
-
-def _spread_over(vertices: Array, faces: NDArray[np.int64], count: int, rng: np.random.Generator) -> Array:
+def _spread_over(vertices: Array, faces: NDArray[np.int32], count: int, rng: np.random.Generator) -> Array:
     """Return count random points (count, 3) on the triangles, as many per area everywhere."""
     a, b, c = (vertices[faces[:, k]] for k in range(3))
     area = np.linalg.norm(np.cross(b - a, c - a), axis=1)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -38,6 +38,7 @@ from poet_loc.io.bop_results_csv import BopResults, read_bop_results
 from poet_loc.io.input_text import read_json
 from poet_loc.io.ply import read_model_points
 from poet_loc.io.poet_results import read_poet_results
+from poet_loc.report.visible_surface import SurfaceSource, VisibleSurface, image_size
 
 Array = NDArray[np.float64]
 Places = dict[tuple[int, int, int], list[int]]
@@ -65,6 +66,9 @@ class EvaluatePosesOptions:
     """Model points per object, evenly picked."""
     scene: int | None = None
     """Scene of a results.json, which does not tell it."""
+    vsd: SurfaceSource = "none"
+    """Measure the visible surface, too (slow): against the split's depth images, or, where it has none, against the
+    true objects rendered together."""
 
 
 @dataclass(frozen=True)
@@ -114,6 +118,8 @@ class ClassErrors:
     recall_mssd: float
     """BOP's average recall, missed objects counted, percent."""
     recall_mspd: float
+    recall_vsd: float
+    """NaN where it was not measured."""
 
 
 @dataclass(frozen=True)
@@ -151,12 +157,13 @@ def evaluate_poses(results: Sequence[Path], truth: str | Path, options: Evaluate
     """
     there = read_truth(truth, options)
     models = read_models(options, sorted(set(there.object_ids.tolist())))
+    surface = None if options.vsd == "none" else VisibleSurface(Path(truth), options.models, options.vsd)
     found = []
     for path in results:
         estimates = read_results(path, options)
         if not set(estimates.scene_ids.tolist()) & set(there.scene_ids.tolist()):
             raise InputError(f"has no scene of {Path(truth).name}", path=path)
-        found.append(compare(Path(path).stem, estimates, there, models))
+        found.append(compare(Path(path).stem, estimates, there, models, surface))
     return found
 
 
@@ -224,7 +231,7 @@ def read_truth(split: str | Path, options: EvaluatePosesOptions) -> Truth:
         np.concatenate(objects),
         RigidTransform.concatenate(list(poses)),
         np.concatenate(cameras),
-        _image_width(folders[0]),
+        image_size(folders[0])[0],
     )
 
 
@@ -245,10 +252,17 @@ def read_models(options: EvaluatePosesOptions, object_ids: Sequence[int]) -> dic
     return models
 
 
-def compare(name: str, estimates: BopResults, truth: Truth, models: Mapping[int, ObjectModel]) -> PoseEvaluation:
-    """Match estimates with the truth and measure them."""
+def compare(
+    name: str,
+    estimates: BopResults,
+    truth: Truth,
+    models: Mapping[int, ObjectModel],
+    surface: VisibleSurface | None = None,
+) -> PoseEvaluation:
+    """Match estimates with the truth and measure them; with `surface` also how much of what is visible agrees."""
     images = set(zip(truth.scene_ids.tolist(), truth.image_ids.tolist()))
     est_rows, ref_rows = match_estimates(estimates, truth)
+    seen = None if surface is None else surface_errors(surface, estimates, truth, models, est_rows, ref_rows)
     classes, pooled = [], []
     for number, model in models.items():
         chosen = truth.object_ids[ref_rows] == number
@@ -260,9 +274,31 @@ def compare(name: str, estimates: BopResults, truth: Truth, models: Mapping[int,
             if i == number
         ]
         cameras = truth.cameras[ref_rows[chosen]]
-        classes.append(class_errors(model, est, ref, cameras, truth.image_width, there, sum(told) - len(est)))
+        errors = class_errors(model, est, ref, cameras, truth.image_width, there, sum(told) - len(est))
+        if seen is not None:
+            recalls = [average_recall(column, RECALL_SHARES, there) for column in seen[chosen].T]
+            errors = replace(errors, recall_vsd=float(np.mean(recalls)))
+        classes.append(errors)
         pooled.append((est, ref))
     return PoseEvaluation(name, tuple(classes), overall_errors(classes, pooled))
+
+
+def surface_errors(
+    surface: VisibleSurface,
+    estimates: BopResults,
+    truth: Truth,
+    models: Mapping[int, ObjectModel],
+    est_rows: NDArray[np.intp],
+    ref_rows: NDArray[np.intp],
+) -> Array:
+    """Return VSD of pairs of rows, one column for each tolerance of `RECALL_SHARES` of the diameter (K, 10)."""
+    errors = np.empty((len(est_rows), len(RECALL_SHARES)))
+    for k, (i, j) in enumerate(zip(est_rows.tolist(), ref_rows.tolist(), strict=True)):
+        number = int(truth.object_ids[j])
+        place = int(truth.scene_ids[j]), int(truth.image_ids[j])
+        taus = np.array(RECALL_SHARES) * models[number].info.diameter_m
+        errors[k] = surface.errors(place, number, estimates.T_cam_obj[i], truth.T_cam_obj[j], taus)
+    return errors
 
 
 def match_estimates(estimates: BopResults, truth: Truth) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
@@ -288,7 +324,7 @@ def class_errors(
     counts = model.name, true, len(est), true - len(est), false
     if len(est) == 0:
         nan = float("nan")
-        return ClassErrors(*counts, 0.0, 0.0, 0.0, 0.0, (0.0,) * 3, (0.0,) * 3, nan, nan, nan, nan, nan, 0.0, 0.0)
+        return ClassErrors(*counts, 0.0, 0.0, 0.0, 0.0, (0.0,) * 3, (0.0,) * 3, nan, nan, nan, nan, nan, 0.0, 0.0, nan)
     distances, nearest = add(est, ref, model.points), add_s(est, ref, model.points)
     chosen = nearest if model.symmetric else distances
     symmetry, info = model.info.symmetry, model.info
@@ -314,6 +350,7 @@ def class_errors(
         float("nan") if symmetry is None else float(turn_about_axis(*turned, symmetry.axis).mean()),
         average_recall(surface, RECALL_SHARES, true),
         average_recall(pixels, thresholds, true),
+        float("nan"),
     )
 
 
@@ -328,6 +365,9 @@ def overall_errors(
     """Return means over the classes, and mean translation and rotation errors over all poses, as published."""
     names = ("auc_add", "auc_add_s", "auc_add_or_s", "auc_add_or_s_exact", "recall_mssd", "recall_mspd")
     overall = {name: float(np.mean([getattr(c, name) for c in classes])) for name in names}
+    if classes and not np.isnan([c.recall_vsd for c in classes]).any():
+        overall["recall_vsd"] = float(np.mean([c.recall_vsd for c in classes]))
+        overall["recall"] = float(np.mean([overall[f"recall_{name}"] for name in ("mssd", "mspd", "vsd")]))
     for k, share in enumerate(YCBV_THRESHOLDS_M):
         overall[f"within_{round(100 * share)}cm"] = float(np.mean([c.within_m[k] for c in classes]))
         overall[f"within_{round(100 * share)}_percent"] = float(np.mean([c.within_diameter[k] for c in classes]))
@@ -361,14 +401,3 @@ def _keyframes(path: Path) -> set[tuple[int, int]]:
         if line.strip():
             pairs.add((int(scene), int(image)))
     return pairs
-
-
-def _image_width(folder: Path) -> int:
-    """Return the width (px) of the images of a scene; 640 where there are none."""
-    from PIL import Image
-
-    for name in ("rgb", "gray"):
-        for path in sorted((folder / name).glob("*"))[:1]:
-            with Image.open(path) as image:
-                return int(image.size[0])
-    return 640

@@ -26,6 +26,11 @@ def auc_table(evaluations: Sequence[PoseEvaluation]) -> Table:
         ("AR MSSD", lambda c: c.recall_mssd, "recall_mssd"),
         ("AR MSPD", lambda c: c.recall_mspd, "recall_mspd"),
     ]
+    if any("recall_vsd" in e.overall for e in evaluations):
+        cells += [
+            ("AR VSD", lambda c: c.recall_vsd, "recall_vsd"),
+            ("AR", lambda c: (c.recall_mssd + c.recall_mspd + c.recall_vsd) / 3, "recall"),
+        ]
     notes = (
         "AUC up to 10 cm by the published rule (a perfect estimate has 99.86); exact: ADD(-S) integrated exactly.",
         "AUC counts matched objects only; the average recalls count missed ones too.",

@@ -65,6 +65,26 @@ def cover(
     return triangle, buffer
 
 
+def distance_image(
+    points: NDArray[np.float64],
+    faces: NDArray[np.int32],
+    camera: NDArray[np.float64],
+    window: tuple[int, int, int, int],
+) -> NDArray[np.float64]:
+    """Return how far from the camera's centre the nearest triangle is at each pixel, m, 0 where there is none.
+
+    points (V, 3) in camera axes, m; camera matrix (3, 3); window left, top, width, height in pixels -> (height, width).
+    """
+    left, top, width, height = window
+    inverse = 1.0 / np.where(points[:, 2] > NEAR, points[:, 2], np.nan)
+    pixels = (points @ camera.T)[:, :2] * inverse[:, None] - [left, top]
+    u, v, weight = np.column_stack([pixels, inverse]).astype(np.float32).T.copy()
+    triangle, weight_seen = cover(u, v, weight, faces, width, height)
+    columns, rows = np.meshgrid(np.arange(width) + left, np.arange(height) + top)
+    rays = np.stack([columns, rows, np.ones_like(rows)], axis=-1) @ np.linalg.inv(camera).T
+    return np.where(triangle >= 0, np.linalg.norm(rays, axis=-1) / np.where(triangle >= 0, weight_seen, 1.0), 0.0)
+
+
 @njit(cache=True, inline="always")
 def _texel(
     texels: NDArray[np.uint8], start: int, size_u: int, size_v: int, x: float, y: float, linear: Array, out: Array
