@@ -158,12 +158,14 @@ def evaluate_poses(results: Sequence[Path], truth: str | Path, options: Evaluate
     there = read_truth(truth, options)
     models = read_models(options, sorted(set(there.object_ids.tolist())))
     surface = None if options.vsd == "none" else VisibleSurface(Path(truth), options.models, options.vsd)
+    stems = [Path(path).stem for path in results]
     found = []
-    for path in results:
+    for path, stem in zip(results, stems):
+        name = stem if stems.count(stem) == 1 else f"{Path(path).absolute().parent.name}/{stem}"
         estimates = read_results(path, options)
         if not set(estimates.scene_ids.tolist()) & set(there.scene_ids.tolist()):
             raise InputError(f"has no scene of {Path(truth).name}", path=path)
-        found.append(compare(Path(path).stem, estimates, there, models, surface))
+        found.append(compare(name, estimates, there, models, surface))
     return found
 
 

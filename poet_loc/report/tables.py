@@ -43,7 +43,7 @@ class Table:
 
     def markdown(self) -> str:
         """Return the table in GitHub's markdown."""
-        header = [c.header + (f" [{c.unit}]" if c.unit else "") for c in self.columns]
+        header = [" ".join(self._told_apart(c)) + (f" [{c.unit}]" if c.unit else "") for c in self.columns]
         cells = [header, *self._marked("**{}**", lambda text: text.replace("|", r"\|"))]
         widths = [max(map(len, column)) for column in zip(*cells, strict=True)]
         lines = ["| " + " | ".join(self._aligned(j, t, widths[j]) for j, t in enumerate(row)) + " |" for row in cells]
@@ -73,19 +73,29 @@ class Table:
         from rich.console import Group
         from rich.text import Text
 
-        parts = [self] if self._width() <= width else self._split()
+        whole = self._width() <= width
+        repeated = any(len(self._told_apart(column)) > 1 for column in self.columns)
+        parts = [self._rich_table()] if whole else [p._rich_table(repeated) for p in self._split()]
         notes = [Text(note, style="dim") for note in self.notes]
-        return Group(Text(self.title, style="bold"), *[part._rich_table() for part in parts], *notes)
+        return Group(Text(self.title, style="bold"), *parts, *notes)
 
-    def _rich_table(self) -> RichTable:
+    def _rich_table(self, titled: bool = False) -> RichTable:
         from rich import box
         from rich.table import Table as RichTable
         from rich.text import Text
 
-        table = RichTable(box=box.SIMPLE_HEAD, pad_edge=False, padding=(0, 1), collapse_padding=True)
+        title = self.columns[-1].group if titled else None
+        table = RichTable(
+            title=title,
+            title_justify="left",
+            box=box.SIMPLE_HEAD,
+            pad_edge=False,
+            padding=(0, 1),
+            collapse_padding=True,
+        )
         last_name = self._names() - 1
         for j, column in enumerate(self.columns[last_name:], start=last_name):
-            header = "\n".join(text for text in (column.header, column.unit) if text)
+            header = "\n".join(text for text in (*self._told_apart(column), column.unit) if text)
             table.add_column(header, justify="left" if j == last_name else "right", no_wrap=j == last_name)
         for i, row in enumerate(self.rows):
             if i in self.rules:
@@ -110,8 +120,14 @@ class Table:
             bold=frozenset((i, kept.index(j)) for i, j in self.bold if j in kept),
         )
 
+    def _told_apart(self, column: Column) -> list[str]:
+        """Return a column's header, after its group's name where another group has the same header."""
+        groups = {other.group for other in self.columns if other.header == column.header}
+        return [column.group, column.header] if len(groups) > 1 else [column.header]
+
     def _width(self) -> int:
-        texts = [[column.header for column in self.columns], [column.unit for column in self.columns], *self.rows]
+        headers = [max(self._told_apart(column), key=len) for column in self.columns]
+        texts = [headers, [column.unit for column in self.columns], *self.rows]
         return sum(2 + max(map(len, column)) for column in list(zip(*texts, strict=True))[self._names() - 1 :])
 
     def _names(self) -> int:

@@ -217,6 +217,17 @@ def test_tables_have_a_row_per_class_and_a_group_per_file(split: Path) -> None:
     assert {c.group for c in tables[0].columns} == {"", "gt", "detected"}
     assert "99.86" in tables[0].markdown()
     assert all(table.latex() and table.markdown() for table in tables)
+    assert "gt ADD-S [%]" in tables[0].markdown()
+    assert "detected ADD-S [%]" in tables[0].markdown()
+
+
+def test_files_of_one_name_are_told_apart_by_their_folders(split: Path) -> None:
+    for folder in ("true_boxes", "detected_boxes"):
+        (split / folder).mkdir()
+        write_bop_results(split / folder / "bop_results.csv", perfect(split))
+    files = [split / folder / "bop_results.csv" for folder in ("true_boxes", "detected_boxes")]
+    found = evaluate_poses(files, split / "test", EvaluatePosesOptions(split / "models"))
+    assert [e.name for e in found] == ["true_boxes/bop_results", "detected_boxes/bop_results"]
 
 
 def test_models_in_text_and_binary(tmp_path: Path) -> None:

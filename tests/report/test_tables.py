@@ -189,3 +189,14 @@ def test_trajectories_that_do_not_meet_say_so() -> None:
         compare_trajectories(late, TRUTH)
     with pytest.raises(InputError, match="whole number"):
         compare_trajectories(TRUTH, TRUTH, CompareOptions(rpe_unit="frames", rpe_delta=1.5))
+
+
+@pytest.mark.parametrize("width", [40, 200])
+def test_equal_headers_are_told_apart_by_their_groups(width: int) -> None:
+    columns = (Column("object"), Column("ADD", "gt", "%"), Column("ADD", "detected", "%"), Column("n", "detected"))
+    table = Table("Areas", columns, (("a long name of an object", "1.00", "2.00", "3"),))
+    assert cells_of(table.markdown().split("\n")[2]) == ["object", "gt ADD [%]", "detected ADD [%]", "n"]
+    console = Console(width=width, record=True)
+    console.print(table.rich(width))
+    shown = console.export_text().split()
+    assert {"gt", "detected", "1.00", "2.00", "3"} <= set(shown)
