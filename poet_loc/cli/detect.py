@@ -19,7 +19,7 @@ class Arguments:
     """Estimate the poses of all objects in images, a video or a log."""
 
     source: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="IMAGES|VIDEO|LOG")]
-    """Folder of images, one image, a video, or a log with frames.csv."""
+    """Folder of images, one image, a video, a log with frames.csv, or a BOP scene or split."""
     out: Path | None = None
     """Folder to write: object_poses.csv, boxes.csv, bop_results.csv, results.json, summary.json, overlays/.  Without
     it a log gets its own object_poses.csv and boxes.csv, and every other command can read it."""
@@ -35,7 +35,6 @@ class Arguments:
 
 def execute(arguments: Arguments) -> None:
     """Detect and say what came out."""
-    from poet_loc.detect.image_source import VIDEO_SUFFIXES
     from poet_loc.detect.stage import detect, detect_in_log
     from poet_loc.io.object_poses_csv import read_object_poses
 
@@ -47,14 +46,23 @@ def execute(arguments: Arguments) -> None:
         return
     if arguments.name:
         raise InputError("--name is for a log's own detections", fix="leave out --name or --out")
-    if arguments.recording and arguments.source.suffix.lower() in VIDEO_SUFFIXES:
-        raise InputError("a recording takes image files, not a video", path=arguments.source, fix="extract its frames")
+    if arguments.recording:
+        _refuse_what_has_no_recording(arguments.source)
     out = detect(arguments.source, arguments.out, arguments.options, arguments.overwrite, progress=True)
     if arguments.recording:
         _record(arguments.source, out, arguments.options)
     summary = json.loads((out / "summary.json").read_text())
     skipped = f", {len(summary['skipped'])} images skipped" if summary["skipped"] else ""
     print(f"{out}: {summary['detections']} object poses in {summary['images']} images{skipped}")
+
+
+def _refuse_what_has_no_recording(source: Path) -> None:
+    from poet_loc.detect.image_source import VIDEO_SUFFIXES, open_images
+
+    if source.suffix.lower() in VIDEO_SUFFIXES:
+        raise InputError("a recording takes image files, not a video", path=source, fix="extract its frames")
+    if source.exists() and len({place.scene for place in open_images(source).places}) > 1:
+        raise InputError("a recording shows one scene", path=source, fix="give the folder of one scene")
 
 
 def _record(source: Path, out: Path, options: DetectOptions) -> None:
@@ -66,7 +74,7 @@ def _record(source: Path, out: Path, options: DetectOptions) -> None:
     from poet_loc.report.rerun_log_images import Attention, write_image_recording
     from poet_loc.report.seen_images import SeenImages
 
-    images = open_images(source, options.stamps, options.rate)
+    images = open_images(source, options.stamps, options.rate, options.keyframes)
     intrinsics = options.intrinsics or images.intrinsics
     camera = None if intrinsics is None else Camera(intrinsics)
     seen = SeenImages(images.stamps_ns, images.files, read_boxes(out / "boxes.csv"))

@@ -24,22 +24,25 @@ class BopDataset:
         least_visible: float = 0.05,
         keyframes: str | Path | None = None,
         keep_empty: bool = False,
+        scenes: Sequence[int] = (),
     ) -> None:
         """Read the scenes of a split folder.
 
         object_ids: id of class 1, 2, ...; empty: the ids that occur, sorted.  least_visible: share of the silhouette
         below which an object does not count.  keyframes: file of lines like 0048/000001 that restricts the images.
+        scenes: numbers of the scenes to read; empty: all.
         """
         self.split = Path(split)
         folders = sorted(p for p in self.split.glob("*") if p.name.isdigit()) if self.split.is_dir() else []
+        folders = [folder for folder in folders if not scenes or int(folder.name) in scenes]
         if not folders:
             raise InputError("no BOP split: it has no folders like 000001", path=split)
         wanted = None if keyframes is None else read_keyframes(keyframes)
-        scenes = [(int(folder.name), folder, read_bop_scene(folder)) for folder in folders]
-        self._ids = tuple(object_ids) or tuple(sorted({int(i) for _, _, s in scenes for i in _objects(s)}))
+        found = [(int(folder.name), folder, read_bop_scene(folder)) for folder in folders]
+        self._ids = tuple(object_ids) or tuple(sorted({int(i) for _, _, s in found for i in _objects(s)}))
         self._class_of = class_of_object(self._ids)
         self._places: list[tuple[int, Path, BopScene, int, np.ndarray]] = []
-        for number, folder, scene in scenes:
+        for number, folder, scene in found:
             rows_of_image = self._rows(scene, least_visible)
             for position, image in enumerate(scene.image_ids.tolist()):
                 rows = rows_of_image.get(image, np.empty(0, np.intp))
@@ -55,11 +58,17 @@ class BopDataset:
     def __len__(self) -> int:
         return len(self._places)
 
+    def places(self) -> list[tuple[int, int]]:
+        """Return scene and image number of every record."""
+        return [(number, int(scene.image_ids[position])) for number, _, scene, position, _ in self._places]
+
     def record(self, index: int) -> ImageRecord:
         """Return an image's record; its boxes are those of the whole object, as in the published annotations."""
         number, folder, scene, position, rows = self._places[index]
         image = int(scene.image_ids[position])
-        path = _image_path(folder, image)
+        path = image_path(folder, image)
+        if path is None:
+            raise InputError(f"image {image:06d} is missing", path=folder, fix="it belongs into rgb/ or gray/")
         matrix = scene.camera_matrices[position]
         found = scene.annotations
         empty = found is None or len(rows) == 0
@@ -126,12 +135,13 @@ def _objects(scene: BopScene) -> set[int]:
     return set() if scene.annotations is None else set(scene.annotations.object_ids.tolist())
 
 
-def _image_path(folder: Path, image: int) -> Path:
+def image_path(folder: Path, image: int) -> Path | None:
+    """Return the file of an image of a scene folder, None where there is none."""
     for name, suffix in IMAGE_FOLDERS:
         path = folder / name / f"{image:06d}{suffix}"
         if path.exists():
             return path
-    raise InputError(f"image {image:06d} is missing", path=folder, fix="it belongs into rgb/ or gray/")
+    return None
 
 
 def _kind(split: str) -> str:

@@ -87,18 +87,23 @@ def to_tensor(image: NDArray[np.uint8]) -> Tensor:
 
 def targets_of(record: ImageRecord) -> PoseTargets:
     """Clip boxes to the image, drop the empty ones, and divide by the image's size."""
+    corners, keep = clipped_corners(record)
+    return PoseTargets(
+        normalise_boxes(corners[keep], (record.size[1], record.size[0])),
+        torch.from_numpy(np.asarray(record.labels, dtype=np.int64))[keep],
+        torch.from_numpy(np.array(record.translations_m, dtype=np.float32).reshape(-1, 3))[keep],
+        torch.from_numpy(np.array(record.rotations, dtype=np.float32).reshape(-1, 3, 3))[keep],
+    )
+
+
+def clipped_corners(record: ImageRecord) -> tuple[Tensor, Tensor]:
+    """Return x1, y1, x2, y2 (n, 4) of an image's boxes within the image, px, and which of them are not empty (n,)."""
     width, height = record.size
     corners = torch.from_numpy(np.array(record.boxes_px, dtype=np.float32).reshape(-1, 4))
     corners[:, 2:] += corners[:, :2]
     corners[:, 0::2].clamp_(0, width)
     corners[:, 1::2].clamp_(0, height)
-    keep = (corners[:, 2] > corners[:, 0]) & (corners[:, 3] > corners[:, 1])
-    return PoseTargets(
-        normalise_boxes(corners[keep], (height, width)),
-        torch.from_numpy(np.asarray(record.labels, dtype=np.int64))[keep],
-        torch.from_numpy(np.array(record.translations_m, dtype=np.float32).reshape(-1, 3))[keep],
-        torch.from_numpy(np.array(record.rotations, dtype=np.float32).reshape(-1, 3, 3))[keep],
-    )
+    return corners, (corners[:, 2] > corners[:, 0]) & (corners[:, 3] > corners[:, 1])
 
 
 def class_of_object(object_ids: Sequence[int]) -> dict[int, int]:

@@ -25,8 +25,8 @@ def attention_of_images(
     At most so many images, evenly spread.  Raises InputError where no image can be read.
     """
     options = options or DetectOptions()
-    images = open_images(source, options.stamps, options.rate)
-    estimator = Estimator(options, images.intrinsics)
+    images = open_images(source, options.stamps, options.rate, options.keyframes)
+    estimator = Estimator(options, images.intrinsics, images.path)
     step = max(1, -(-len(images.files) // most))
     looked = {}
     with torch.no_grad():

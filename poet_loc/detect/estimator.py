@@ -16,6 +16,7 @@ from torch import Tensor
 
 from poet_loc.core.input_error import InputError
 from poet_loc.data.samples import to_tensor
+from poet_loc.detect.bop_images import TrueBoxes
 from poet_loc.detect.image_source import Picture
 from poet_loc.detect.options import DetectOptions
 from poet_loc.io.boxes_csv import read_boxes
@@ -24,9 +25,10 @@ from poet_loc.model.checkpoint import ModelConfig, load_model
 from poet_loc.model.fast_poses import FastPoses
 from poet_loc.model.heads import covariance_matrices, rotation_matrices
 from poet_loc.model.poet import PoET, PoseOutput
-from poet_loc.model.queries import QueryBoxes, queries_from_detections
+from poet_loc.model.queries import QueryBoxes, normalise_boxes, queries_from_detections, stack_queries
 
 Array = NDArray[np.float64]
+Intrinsics = tuple[float, float, float, float]
 
 
 @dataclass(frozen=True)
@@ -80,7 +82,10 @@ class PoseEngine(Protocol):
 class Estimator:
     """Detector and pose network, ready for pictures."""
 
-    def __init__(self, options: DetectOptions, intrinsics: tuple[float, float, float, float] | None = None) -> None:
+    def __init__(
+        self, options: DetectOptions, intrinsics: Intrinsics | None = None, source: str | Path | None = None
+    ) -> None:
+        """intrinsics: of the pictures, where the options have none; source: what holds the true boxes, if asked for."""
         self.options = options
         if options.threads is not None:
             torch.set_num_threads(options.threads)
@@ -93,8 +98,19 @@ class Estimator:
             raise InputError("this network needs the camera's intrinsics", fix="give --intrinsics fx fy cx cy")
         given = {} if options.boxes is None else read_boxes(options.boxes)
         self.boxes = {name: torch.from_numpy(rows).float() for name, rows in given.items()}
+        self.true_boxes = self._true_boxes(source) if options.true_boxes else None
         self.multiple = self.network.detector.shape().multiple
         self._warned = False
+
+    def _true_boxes(self, source: str | Path | None) -> TrueBoxes:
+        if self.options.boxes is not None:
+            raise InputError("--boxes and --true-boxes ask for different boxes", fix="leave out one of them")
+        return TrueBoxes(Path(source or "."), self.config.object_ids, self.config.network.class_count)
+
+    def camera_of(self, picture: Picture) -> Intrinsics | None:
+        """Return fx, fy, cx, cy (px) of a picture."""
+        known = None if picture.place is None else picture.place.intrinsics
+        return self.options.intrinsics or known or self.intrinsics
 
     def _engine(self) -> PoseEngine:
         options = self.options
@@ -119,18 +135,24 @@ class Estimator:
 
     def features(self, pictures: Sequence[Picture]) -> tuple[ImageBatch, Features]:
         """Return pictures as a batch, and the detector's maps of it."""
-        given = None if self.intrinsics is None else torch.tensor([self.intrinsics] * len(pictures))
+        cameras = [self.camera_of(picture) for picture in pictures]
+        given = None if None in cameras else torch.tensor(cameras)
         batch = batch_images([to_tensor(p.pixels) for p in pictures], given, self.multiple).to(self.device)
         return batch, self.network.extract(batch)
 
     def queries(self, pictures: Sequence[Picture], batch: ImageBatch, features: Features) -> QueryBoxes:
-        """Return the boxes to ask about: those of the file that the options name, else the detector's.
+        """Return the boxes to ask about: the true ones or those of a file, if the options say so, else the detector's.
 
         Raises InputError for a class beyond the network's.
         """
         nothing = torch.zeros(0, 6)
+        if self.true_boxes is not None:
+            known = [self.true_boxes.of(p.place) for p in pictures if p.place is not None]
+            boxes = [normalise_boxes(rows, self._unit(p, batch)) for p, (rows, _) in zip(pictures, known)]
+            labels = [label for _, label in known]
+            return stack_queries(boxes, labels, self.config.network.queries).to(self.device)
         if self.options.boxes is not None:
-            found = [self.boxes.get(Path(p.name).name, nothing) for p in pictures]
+            found = [self.boxes.get(p.name, self.boxes.get(Path(p.name).name, nothing)) for p in pictures]
         else:
             found = self.network.detector.detect(features)
         found = [rows[rows[:, 4] >= self.options.score] for rows in found]
@@ -141,13 +163,23 @@ class Estimator:
             raise InputError(f"class {beyond[0]} is beyond the network's {self.config.network.class_count} classes")
         return queries_from_detections(found, batch.size, self.config.network.queries, self.device)
 
+    def _unit(self, picture: Picture, batch: ImageBatch) -> tuple[int, int]:
+        """Return the (H, W) px that boxes are shares of: the padded batch, but of true boxes the picture.
+
+        As in the published training; networks that look at pixels themselves know the padded batch alone.
+        """
+        network = self.config.network
+        padded = self.true_boxes is None or network.needs_intrinsics or network.query_features != "none"
+        return batch.size if padded else (picture.pixels.shape[0], picture.pixels.shape[1])
+
     def _sighting(
         self, picture: Picture, output: PoseOutput, image: int, batch: ImageBatch, seconds: float
     ) -> Sighting:
         count = output.queries.counts[image]
         labels = output.queries.classes[image, :count].cpu().numpy()
         height, width = picture.pixels.shape[:2]
-        shares = torch.tensor([batch.size[1] / width, batch.size[0] / height] * 2)
+        unit = self._unit(picture, batch)
+        shares = torch.tensor([unit[1] / width, unit[0] / height] * 2)
         return Sighting(
             picture,
             labels,

@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 import warnings
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from poet_loc.core.input_error import InputError
 from poet_loc.data.samples import read_image
+from poet_loc.detect.bop_images import BopPlace, bop_files, is_bop
 from poet_loc.io.calibration_yaml import read_calibration
 from poet_loc.io.frames_csv import read_frames
 
@@ -30,6 +31,8 @@ class Picture:
     frame: int
     pixels: NDArray[np.uint8]
     """(h, w, 3) RGB."""
+    place: BopPlace | None = None
+    """Of an image of a BOP scene."""
 
 
 @dataclass(frozen=True)
@@ -44,14 +47,19 @@ class ImageSource:
     frames: NDArray[np.int64]
     rate: float
     intrinsics: tuple[float, float, float, float] | None = None
+    places: tuple[BopPlace, ...] = ()
+    """Of the files of BOP scenes."""
 
     def __iter__(self) -> Iterator[Picture]:
         if not self.files:
             yield from self._video()
             return
-        for file, stamp, frame in zip(self.files, self.stamps_ns.tolist(), self.frames.tolist()):
+        several = len({place.scene for place in self.places}) > 1
+        places = self.places or (None,) * len(self.files)
+        for file, stamp, frame, place in zip(self.files, self.stamps_ns.tolist(), self.frames.tolist(), places):
+            name = file.relative_to(file.parents[2]).as_posix() if several else file.name
             try:
-                yield Picture(file.name, stamp, frame, read_image(file))
+                yield Picture(name, stamp, frame, read_image(file), place)
             except InputError as error:
                 warnings.warn(f"skipped: {error}", stacklevel=2)
 
@@ -75,15 +83,17 @@ class ImageSource:
             raise InputError("the video has no readable frame", path=self.path)
 
 
-def open_images(path: str | Path, stamps: str | Path | None = None, rate: float = 30.0) -> ImageSource:
-    """Open a log (with frames.csv), a folder of images, one image, or a video.
+def open_images(
+    path: str | Path, stamps: str | Path | None = None, rate: float = 30.0, keyframes: Path | None = None
+) -> ImageSource:
+    """Open a log (with frames.csv), a BOP scene or split, a folder of images, one image, or a video.
 
-    Stamps come from frames.csv, else from file names that are nanoseconds, else from the rate.  Raises InputError where
-    there is nothing to look at.
+    keyframes restrict the images of a BOP split.  Stamps come from frames.csv, else from file names that are
+    nanoseconds, else from the rate.  Raises InputError where there is nothing to look at.
     """
     path = Path(path)
     if path.is_dir():
-        return _folder(path, stamps, rate)
+        return _folder(path, stamps, rate, keyframes)
     if not path.exists():
         raise InputError("no such image, folder, video or log", path=path)
     suffix = path.suffix.lower()
@@ -94,7 +104,7 @@ def open_images(path: str | Path, stamps: str | Path | None = None, rate: float 
     raise InputError(f"{suffix or 'a file without suffix'} is neither an image nor a video", path=path)
 
 
-def _folder(path: Path, stamps: str | Path | None, rate: float) -> ImageSource:
+def _folder(path: Path, stamps: str | Path | None, rate: float, keyframes: Path | None) -> ImageSource:
     calibration = path / "calibration.yaml"
     camera = read_calibration(calibration).camera if calibration.exists() else None
     intrinsics = None if camera is None else camera.intrinsics
@@ -103,6 +113,11 @@ def _folder(path: Path, stamps: str | Path | None, rate: float) -> ImageSource:
         frames = read_frames(table)
         files = tuple(path / image for image in frames.images)
         return ImageSource(path, files, frames.stamps_ns, frames.frames, rate, intrinsics)
+    if is_bop(path):
+        bop, places = bop_files(path, keyframes)
+        return replace(_files(path, bop, rate, places[0].intrinsics), places=tuple(places))
+    if keyframes is not None:
+        raise InputError("is no BOP scene or split, it has no key frames", path=path, fix="leave out --keyframes")
     found = sorted((p for p in path.iterdir() if p.suffix.lower() in IMAGE_SUFFIXES), key=_by_number)
     if not found and (path / "rgb").is_dir():
         found = sorted((p for p in (path / "rgb").iterdir() if p.suffix.lower() in IMAGE_SUFFIXES), key=_by_number)

@@ -29,14 +29,19 @@ class DetectOptions:
     """Detections below this score are dropped."""
     boxes: Path | None = None
     """Boxes and classes from elsewhere instead of the detector's: csv with image,x1,y1,x2,y2,score,class (px)."""
+    true_boxes: bool = False
+    """Of a BOP scene or split: ask about the boxes and classes of the objects that are there."""
+    keyframes: Path | None = None
+    """Of a BOP split: file of lines like 0048/000001 that restricts the images."""
     stamps: Path | None = None
     """frames.csv with the stamps of the images, if it does not lie in the folder."""
     rate: float = 30.0
     """Hz, for images without stamps: frame k gets k / rate."""
     intrinsics: tuple[float, float, float, float] | None = None
-    """fx, fy, cx, cy (px); else those of the log's calibration.yaml, else of the camera of the training images."""
+    """fx, fy, cx, cy (px); else those of the BOP scene or of the log's calibration.yaml, else of the camera of the
+    training images."""
     scene: int = 0
-    """Scene number in the BOP results."""
+    """Scene number in the BOP results, for images that are no BOP scene."""
     unknown_objects: bool = False
     """On a log with landmarks.json, keep detections of objects that the map does not have."""
     overlays: bool = False

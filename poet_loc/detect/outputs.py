@@ -92,10 +92,18 @@ def object_poses(sightings: Sequence[Sighting]) -> ObjectPoses:
 
 
 def bop_results(sightings: Sequence[Sighting], scene: int) -> BopResults:
-    """Return the detections as BOP wants them; the image id is the number in the file name."""
-    ids = [int("".join(c for c in Path(s.picture.name).stem if c.isdigit()) or s.picture.frame) for s in sightings]
+    """Return the detections as BOP wants them; scene and image are those of the data set, if the picture is of one.
+
+    Else the image id is the number in the file name.
+    """
+    places = [sighting.picture.place for sighting in sightings]
+    names = [Path(sighting.picture.name).stem for sighting in sightings]
+    ids = [
+        int("".join(c for c in name if c.isdigit()) or sighting.picture.frame) if place is None else place.image
+        for name, place, sighting in zip(names, places, sightings)
+    ]
     return BopResults(
-        repeated(sightings, [scene] * len(sightings), np.int64),
+        repeated(sightings, [scene if place is None else place.scene for place in places], np.int64),
         repeated(sightings, ids, np.int64),
         np.concatenate([s.object_ids for s in sightings]),
         np.concatenate([s.scores for s in sightings]),

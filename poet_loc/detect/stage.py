@@ -31,15 +31,15 @@ def detect(
     overwrite: bool = False,
     progress: bool = False,
 ) -> Path:
-    """Estimate the poses of all objects in a folder of images, an image, a video or a log.
+    """Estimate the poses of all objects in a folder of images, an image, a video, a log, or a BOP scene or split.
 
     Writes object_poses.csv (covariances where the network tells them), boxes.csv, bop_results.csv, results.json,
     summary.json, and overlays/.  Of a log with a map only the map's objects are kept; one warning counts the others.
     Memory does not grow with the number of images.  Raises InputError where no image can be read.
     """
     options = options or DetectOptions()
-    images = open_images(source, options.stamps, options.rate)
-    estimator = Estimator(options, images.intrinsics)
+    images = open_images(source, options.stamps, options.rate, options.keyframes)
+    estimator = Estimator(options, images.intrinsics, images.path)
     seconds: list[float] = []
     counts = {"images": 0, "detections": 0}
     known, unknown = _objects_of_map(Path(source), options), Counter[int]()
@@ -98,8 +98,8 @@ def detect_in_log(
 def sightings(source: str | Path, options: DetectOptions | None = None) -> Iterator[Sighting]:
     """Yield what is in each picture, without writing anything."""
     options = options or DetectOptions()
-    images = open_images(source, options.stamps, options.rate)
-    for found in _sightings(images, Estimator(options, images.intrinsics), options.batch, []):
+    images = open_images(source, options.stamps, options.rate, options.keyframes)
+    for found in _sightings(images, Estimator(options, images.intrinsics, images.path), options.batch, []):
         yield from found
 
 
@@ -148,5 +148,5 @@ def _told(images: ImageSource, skipped: list[str]) -> Iterator[Picture]:
 def _draw(found: list[Sighting], estimator: Estimator, options: DetectOptions, folder: Path) -> None:
     folder.mkdir(exist_ok=True)
     for sighting in found:
-        name = f"{Path(sighting.picture.name).stem}.png"
-        draw_overlay(sighting, estimator.intrinsics, options.axis_m, folder / name)
+        name = "_".join(Path(sighting.picture.name).with_suffix("").parts) + ".png"
+        draw_overlay(sighting, estimator.camera_of(sighting.picture), options.axis_m, folder / name)

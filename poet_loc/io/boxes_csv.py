@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+from collections import defaultdict
 from collections.abc import Mapping
 from pathlib import Path
 
@@ -21,6 +22,8 @@ HEADER = ["image", "x1", "y1", "x2", "y2", "score", "class"]
 def read_boxes(path: str | Path) -> dict[str, Array]:
     """Read boxes by file name of their image, (n, 6) each: x1, y1, x2, y2 (px), score, class from 1.
 
+    The name is without its folder, unless there are images of one name in several folders.
+
     Raises InputError, with the line, for a malformed row.
     """
     reader = csv.reader(read_text(path).splitlines())
@@ -38,8 +41,15 @@ def read_boxes(path: str | Path) -> dict[str, Array]:
             raise InputError("is no row of boxes", path=path, line=reader.line_num, fix=",".join(HEADER)) from None
         if not (x2 > x1 and y2 > y1 and label >= 1 and label == int(label)):
             raise InputError("needs x1 < x2, y1 < y2 and a class from 1", path=path, line=reader.line_num)
-        rows.setdefault(Path(name.strip()).name, []).append([x1, y1, x2, y2, score, label])
-    return {name: np.array(found) for name, found in rows.items()}
+        rows.setdefault(name.strip(), []).append([x1, y1, x2, y2, score, label])
+    found: dict[str, list[list[float]]] = {}
+    folders: dict[str, set[Path]] = defaultdict(set)
+    for path_of_image in map(Path, rows):
+        folders[path_of_image.name] |= {path_of_image.parent} - {Path()}
+    for name, values in rows.items():
+        short = Path(name).name
+        found.setdefault(short if len(folders[short]) < 2 else name, []).extend(values)
+    return {name: np.array(values) for name, values in found.items()}
 
 
 def write_boxes(path: str | Path, boxes: Mapping[str, Array]) -> None:

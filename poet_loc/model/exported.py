@@ -43,6 +43,9 @@ class ExportedPoses:
         if features.image_size != self.image_size or bool(image_mask.any()):
             height, width = self.image_size
             raise InputError(f"the graph is for whole images of {width}x{height}", path=self.path)
+        asked, possible = queries.boxes.shape[1], self.network.options.queries
+        if asked != possible:
+            raise InputError(f"{asked} boxes in an image, the graph is for {possible}", path=self.path)
         position, content = self.network.query_codes(queries)
         if self.network.options.query_features == "roi":
             content = content + self.network.roi_features(features.maps, queries)

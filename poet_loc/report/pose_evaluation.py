@@ -161,7 +161,7 @@ def evaluate_poses(results: Sequence[Path], truth: str | Path, options: Evaluate
     stems = [Path(path).stem for path in results]
     found = []
     for path, stem in zip(results, stems):
-        name = stem if stems.count(stem) == 1 else f"{Path(path).absolute().parent.name}/{stem}"
+        name = stem if stems.count(stem) == 1 else Path(path).absolute().parent.name
         estimates = read_results(path, options)
         if not set(estimates.scene_ids.tolist()) & set(there.scene_ids.tolist()):
             raise InputError(f"has no scene of {Path(truth).name}", path=path)

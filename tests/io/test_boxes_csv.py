@@ -25,6 +25,19 @@ def test_a_file_written_by_hand(tmp_path: Path) -> None:
     np.testing.assert_array_equal(found["000001.jpg"], [[1.5, 2, 30.25, 40, 0.5, 7], [-3, 2, 30, 40, 1, 2]])
 
 
+def test_equal_names_in_several_folders_stay_apart(tmp_path: Path) -> None:
+    rows = [
+        "000048/rgb/000001.png,1,2,30,40,1,2",
+        "000049/rgb/000001.png,1,2,30,40,1,3",
+        "000049/rgb/2.png,1,2,3,4,1,1",
+    ]
+    (tmp_path / "boxes.csv").write_text("\n".join([GOLDEN.split("\n")[0], *rows]))
+    found = read_boxes(tmp_path / "boxes.csv")
+    assert {name: rows[0, 5] for name, rows in found.items()} == {
+        "000048/rgb/000001.png": 2, "000049/rgb/000001.png": 3, "2.png": 1
+    }  # fmt: skip
+
+
 def test_there_and_back(tmp_path: Path) -> None:
     rng = np.random.default_rng(0)
     corners = rng.uniform(0, 100, (5, 4)).cumsum(axis=1)[:, [0, 1, 2, 3]]

@@ -227,7 +227,7 @@ def test_files_of_one_name_are_told_apart_by_their_folders(split: Path) -> None:
         write_bop_results(split / folder / "bop_results.csv", perfect(split))
     files = [split / folder / "bop_results.csv" for folder in ("true_boxes", "detected_boxes")]
     found = evaluate_poses(files, split / "test", EvaluatePosesOptions(split / "models"))
-    assert [e.name for e in found] == ["true_boxes/bop_results", "detected_boxes/bop_results"]
+    assert [e.name for e in found] == ["true_boxes", "detected_boxes"]
 
 
 def test_models_in_text_and_binary(tmp_path: Path) -> None:
