@@ -19,11 +19,12 @@ from fusion.graph_builder import GraphBuilder
 from fusion.graph_factors import Detection, error_at
 from fusion.graph_model import BIAS_COLUMNS
 from fusion.graph_motion import MotionChain
+from fusion.graph_odometry import odometry_at, odometry_error_at
 from fusion.graph_rows import Between
 from fusion.graph_smoother import detection_of, detections, forget_biases, joint_covariance
 from fusion.graph_variables import block_diagonal, keyframe_variables
 from fusion.graph_walk import Keyframe, Walk
-from fusion.measurements import OBJECT_POSE
+from fusion.measurements import OBJECT_POSE, ODOMETRY_STEP
 from fusion.nav_state import CORE
 from fusion.options import FuseOptions, Graph
 from fusion.place_watch import RELEASED
@@ -129,6 +130,7 @@ def _read_state(stretch: Stretch, i: int, builder: GraphBuilder) -> Array:
 def _build(stretch: Stretch, builder: GraphBuilder, walk: Walk) -> tuple[gtsam.NonlinearFactorGraph, gtsam.Values]:
     first, *rest = zip(stretch.keyframes, stretch.states, strict=True)
     builder.start(first[0].stamp_ns, stretch.x, stretch.P, stretch.known, first[1])
+    builder.add_odometry(odometry_at(walk, first[0]))
     stretch.first, stretch.biases = builder.keyframe, []
     for keyframe, x in rest:
         builder.place_new_objects(x)
@@ -136,6 +138,7 @@ def _build(stretch: Stretch, builder: GraphBuilder, walk: Walk) -> tuple[gtsam.N
         stretch.biases.append(builder.newest_biases)
         builder.add_keyframe(keyframe.stamp_ns, x)
         forget_biases(builder, keyframe)
+        builder.add_odometry(odometry_at(walk, keyframe))
         builder.add_detections(detections(builder, walk, keyframe.at))
     stretch.biases.append(builder.newest_biases)
     graph, values, _ = builder.take()
@@ -171,16 +174,31 @@ def _decide(stretch: Stretch, builder: GraphBuilder, walk: Walk) -> bool:
     What may have become of an object's bias since it was last seen widens the gate; what the solution is unsure of
     does not.
     """
-    decisions, changed = walk.columns.decisions, False
+    decisions, changed = walk.columns.decisions, _decide_odometry(stretch, walk)
     for i, keyframe in enumerate(stretch.keyframes):
         later = stretch.keyframes[i + 1].between if i + 1 < len(stretch.keyframes) else range(0)
         for j in (*(keyframe.at if i else ()), *later):
-            if decisions[j] & RELEASED:
+            if decisions[j] & RELEASED or walk.columns.kinds[j] == ODOMETRY_STEP:
                 continue
             d = detection_of(builder, walk, j, keyframe.stamp_ns, stretch.states[i], ACCEPTED)
             decision = _gate(d, stretch.states[i], stretch.spread[i], builder, walk, j)
             changed |= decision != decisions[j]
             decisions[j] = decision
+    return changed
+
+
+def _decide_odometry(stretch: Stretch, walk: Walk) -> bool:
+    c, limits, changed, then = walk.columns, walk.memory.limits, False, -1
+    for i, keyframe in enumerate(stretch.keyframes):
+        step = odometry_at(walk, keyframe, ACCEPTED)
+        if step is None:
+            continue
+        if then >= 0:
+            j, e = step.measurement, odometry_error_at(step, stretch.states[then], stretch.states[i])
+            decision = int(eskf.gate(step.covariance, e, limits, limits[PARTIAL], *_scratch(), c.nis[j]))
+            changed |= decision != c.decisions[j]
+            c.decisions[j] = decision
+        then = i
     return changed
 
 
@@ -190,7 +208,11 @@ def _gate(d: Detection, x: Array, spread: Array, builder: GraphBuilder, walk: Wa
     for kind in range(builder.layout.bias_kinds if d.kind == OBJECT_POSE else 0):
         root = J[:, BIAS_COLUMNS + 6 * kind : BIAS_COLUMNS + 6 * kind + 6] * spread[d.object + kind * size]
         S += root @ root.T
-    return int(eskf.gate(S, e, limits, limits[PARTIAL], np.zeros((6, 6)), np.zeros(6), nis))
+    return int(eskf.gate(S, e, limits, limits[PARTIAL], *_scratch(), nis))
+
+
+def _scratch() -> tuple[Array, Array]:
+    return np.zeros((6, 6)), np.zeros(6)
 
 
 def _write_rows(stretch: Stretch, walk: Walk, with_imu: bool) -> None:

@@ -14,13 +14,16 @@ from fusion import eskf
 from fusion.graph_factors import Detection, Model, bias_factor, measurement_factor
 from fusion.graph_model import bias_step
 from fusion.graph_motion import MotionChain
+from fusion.graph_odometry import OdometryStep, odometry_factor
 from fusion.graph_variables import (
+    CloneVariable,
     Variable,
     errors_of,
     joint_prior,
     keyframe_variables,
     object_bias_key,
     object_variable,
+    pose_key,
     static_variables,
 )
 from fusion.measurements import OBJECT_POSE
@@ -73,7 +76,8 @@ class GraphBuilder:
     """Collects what a new keyframe adds: factors, initial values, and the keyframe at which each variable came.
 
     Object poses, where they are estimated, and extrinsics, time offset and gravity are one variable each. An object's
-    bias has a variable per keyframe that sees the object. x is the nominal array from which new variables start.
+    bias has a variable per keyframe that sees the object. x is the nominal array from which new variables start, clone
+    the keyframe of the last odometry, -1 where there was none.
     """
 
     def __init__(self, layout: StateLayout, x: Array, bias_model: Array, chain: MotionChain, options: Graph) -> None:
@@ -83,6 +87,7 @@ class GraphBuilder:
         self.chains: dict[tuple[int, int], BiasChain] = {}
         self._statics: dict[int, Variable] = {}
         self._bias_count = 0
+        self.clone = -1
         self._clear()
 
     def _clear(self) -> None:
@@ -115,8 +120,12 @@ class GraphBuilder:
 
     @property
     def lasting(self) -> list[Variable]:
-        """What must not be marginalised: statics, objects, each object's newest biases."""
-        return [*self._statics.values(), *(chain.variable for chain in self.chains.values() if chain.begun)]
+        """What must not be marginalised: statics, objects, the last odometry's pose, each object's newest biases."""
+        clone = [self._clone_variable()] if 0 <= self.clone < self.keyframe else []
+        return [*self._statics.values(), *clone, *(chain.variable for chain in self.chains.values() if chain.begun)]
+
+    def _clone_variable(self) -> Variable:
+        return CloneVariable(pose_key(self.clone), errors_of(self.layout, "clone"), self.layout.clone_start)
 
     @property
     def newest_biases(self) -> list[tuple[int, int]]:
@@ -132,7 +141,7 @@ class GraphBuilder:
         values are those of x, or of start_from.
         """
         self._clear()
-        self.x, layout = x.copy() if start_from is None else start_from.copy(), self.layout
+        self.x, layout, self.clone = x.copy() if start_from is None else start_from.copy(), self.layout, -1
         self._statics = {variable.key: variable for variable in static_variables(layout)}
         for k in range(layout.n_objects if layout.objects else 0):
             if known[k] > 0.0:
@@ -172,6 +181,14 @@ class GraphBuilder:
                 self._meet(d.object)
             biases = [self._bias_here(d.object, kind) for kind in kinds]
             self.graph.add(measurement_factor(d, self.keyframe, biases, self.model))
+
+    def add_odometry(self, step: OdometryStep | None) -> None:
+        """Add the odometry that ends at the newest keyframe, where there is one; the next is measured from there."""
+        if step is None:
+            return
+        if self.clone >= 0 and step.size > 0:
+            self.graph.add(odometry_factor(step, self.clone, self.keyframe, self.model))
+        self.clone = self.keyframe
 
     def place_new_objects(self, x: Array) -> None:
         """Let objects that the graph has not met start where they stand in a nominal array."""

@@ -19,6 +19,7 @@ from typing import Any, SupportsIndex
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy.spatial.transform import Rotation
 
 from fusion import memory
 from fusion.fuse import LoopColumns, loop_columns
@@ -31,7 +32,6 @@ from fusion.nav_state import StateLayout
 from fusion.online import Estimator, Health, OnlineOptions, empty_problem
 from fusion.options import FuseOptions
 from fusion.prepare import Problem
-from poet_loc.core.input_error import InputError
 from poet_loc.core.records import Calibration, ImuSamples, LandmarkMap
 
 Array = NDArray[np.float64]
@@ -66,8 +66,6 @@ class GraphEstimator(Estimator):
         layout: StateLayout | None = None,
     ) -> None:
         options = replace(options or FuseOptions(), estimator="graph")
-        if options.motion == "imu+odometry":
-            raise InputError("the graph moves by the IMU or by odometry, not by both", fix="choose another --motion")
         self._problem = empty_problem(calibration, landmark_map, options, layout)
         super().__init__(calibration, landmark_map, options, online, layout)
 
@@ -91,6 +89,7 @@ class GraphEstimator(Estimator):
         self._kept: deque[_Kept] = deque()
         self._not_in_map = self._duplicates = self._too_late = self._too_early = self._malformed = 0
         self._overflowed = self._replays = 0
+        self._odometry: tuple[int, Array, Array] | None = None
 
     def feed_imu(self, stamp_ns: SupportsIndex, angular_velocity: ArrayLike, specific_force: ArrayLike) -> None:
         """Take in one IMU sample: (3,) rad/s and (3,) m/s^2 in imu axes; they must come in order."""
@@ -125,17 +124,20 @@ class GraphEstimator(Estimator):
             self._object_health(),
         )
 
-    def _feed_poses(
-        self, stamp_ns: SupportsIndex, kind: int, landmarks: Ints, R_m: Array, t_m: Array, R: Array
-    ) -> None:
-        stamp, count = operator.index(stamp_ns) + self._shift_ns, len(landmarks)
-        R_m, t_m, R = R_m.reshape(-1, 9), t_m.reshape(-1, 3), R.reshape(-1, 6, 6)
-        sound = np.isfinite(np.hstack([R_m, t_m, R.reshape(-1, 36)])).all(axis=1)
-        self._malformed += count - int(np.count_nonzero(sound))
+    def _feed_poses(self, stamp_ns: SupportsIndex, kind: int, landmarks: Ints, q: Array, t_m: Array, R: Array) -> None:
+        stamp = operator.index(stamp_ns) + self._shift_ns
+        if not (q != 0.0).any(axis=1).all():
+            raise ValueError("a quaternion is zero")
+        sound = np.asarray(np.isfinite(np.hstack([q, t_m, R.reshape(-1, 36)])).all(axis=1))
+        self._malformed += int(np.count_nonzero(~sound))
+        R_m = Rotation.from_quat(np.where(sound[:, None], q, 1.0)).as_matrix().reshape(-1, 9)
         put = [self._put(stamp, kind, int(landmarks[i]), R_m[i], t_m[i], R[i]) for i in np.flatnonzero(sound)]
         if any(put) and self._walk.begun and stamp <= self.memory.counters[memory.NOW]:
             self._restore(stamp)
         self._run()
+
+    def _refused(self) -> int:
+        return self._too_late + self._too_early + self._malformed + self._overflowed
 
     def _put(self, stamp: int, kind: int, k: int, R_m: Array, t_m: Array, R: Array) -> bool:
         """Put a pose in its place by stamp and landmark; tell whether it is taken."""

@@ -15,11 +15,13 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import solve_triangular
 
-from fusion.eskf import ACCEPTED, POSITION_ONLY, ROTATION_ONLY
+from fusion.eskf import ACCEPTED, POSITION_ONLY, ROTATION_ONLY, clone_pose
 from fusion.graph_builder import GraphBuilder
 from fusion.graph_factors import Detection
+from fusion.graph_odometry import odometry_at
 from fusion.graph_variables import block_diagonal
 from fusion.graph_walk import Keyframe, Walk
+from fusion.measurements import ODOMETRY_STEP
 from fusion.memory import Memory
 from fusion.options import Graph
 
@@ -65,6 +67,7 @@ class FixedLagSmoother:
         """Begin at a keyframe with the filter's state as prior."""
         m = walk.memory
         self.builder.start(keyframe.stamp_ns, m.x, m.P, m.known)
+        self.builder.add_odometry(odometry_at(walk, keyframe))
         self._update()
 
     def extend(self, keyframe: Keyframe, walk: Walk) -> None:
@@ -74,6 +77,7 @@ class FixedLagSmoother:
         builder.add_detections(detections(builder, walk, keyframe.between))
         builder.add_keyframe(keyframe.stamp_ns)
         forget_biases(builder, keyframe)
+        builder.add_odometry(odometry_at(walk, keyframe))
         builder.add_detections(detections(builder, walk, keyframe.at))
         self._update()
         self._write_back(walk.memory)
@@ -148,6 +152,8 @@ class FixedLagSmoother:
             P[:, first : first + 6] *= phi
             P[range(first, first + 6), range(first, first + 6)] += sigma**2
         m.P[np.ix_(at, at)] = 0.5 * (P + P.T)
+        if builder.clone == builder.keyframe:
+            clone_pose(m.x, m.P, m.layout)
 
 
 def isam_parameters(options: Graph) -> gtsam.ISAM2Params:
@@ -176,8 +182,9 @@ def forget_biases(builder: GraphBuilder, keyframe: Keyframe) -> None:
 
 
 def detections(builder: GraphBuilder, walk: Walk, which: range) -> list[Detection]:
-    """Return the measurements of a keyframe that passed the gate, as the filter used them."""
-    decided = ((i, int(walk.columns.decisions[i]) & ACCEPTED) for i in which)
+    """Return the poses of a keyframe that passed the gate, as the filter used them."""
+    c = walk.columns
+    decided = ((i, int(c.decisions[i]) & ACCEPTED) for i in which if c.kinds[i] != ODOMETRY_STEP)
     return [detection_of(builder, walk, i, builder.stamp_ns, builder.x, passed) for i, passed in decided if passed]
 
 

@@ -134,6 +134,14 @@ class PoseVariable(Variable):
         return block_diagonal([_EYE, x[self.at : self.at + 9].reshape(3, 3)])
 
 
+class CloneVariable(PoseVariable):
+    """The pose at the last odometry: the filter's clone of it has its error in world axes."""
+
+    def to_filter(self, x: Array) -> Array:
+        """Return the derivative of [xi, rho], R_true = Exp(xi) R and p_true = Exp(xi) p + rho, by gtsam's tangent."""
+        return np.asarray(pose3(x, self.at).AdjointMap())
+
+
 class ImuBiasVariable(Variable):
     """The IMU's bias: [accelerometer, gyroscope] in gtsam, [gyroscope, accelerometer] in the filter."""
 

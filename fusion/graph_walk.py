@@ -13,7 +13,7 @@ from fusion.compiled import njit
 from fusion.eskf import fit_symmetry
 from fusion.filter_loop import advance, angular_velocity_at, begin, emit, measure
 from fusion.fuse import loop_columns
-from fusion.measurements import OBJECT_POSE, camera_in_world
+from fusion.measurements import OBJECT_POSE, ODOMETRY_STEP, camera_in_world
 from fusion.memory import MODE, NOW, RESTARTS, TRACKING, Memory, Work, views, work_views
 from fusion.nav_state import AT_BIASES, N_BIAS_KINDS, N_OBJECTS, OBJECT_SIZE, OBJECTS, TIME_OFFSET, Array, Ints
 from fusion.options import FuseOptions
@@ -63,9 +63,10 @@ def filter_until_keyframe(
     """Filter up to the next keyframe and return KEYFRAME, STARTED where the filter (re)started there, or END.
 
     A keyframe is due at the first stamp with measurements spacing_ns after the last one, where an object's bias jumped,
-    and at an IMU sample idle_ns after the last one. Its own measurements are taken in. fitted_rotations and
-    fitted_covariances get each measurement as it was used (symmetry chosen, noise scaled); fresh (kinds * objects * 2
-    halves) tells which biases nothing ties to the motion: those that are 1 and were 0 have just been forgotten.
+    wherever odometry is measured, and at an IMU sample idle_ns after the last one. Its own measurements are taken in.
+    fitted_rotations and fitted_covariances get each measurement as it was used (symmetry chosen, noise scaled); fresh
+    (kinds * objects * 2 halves) tells which biases nothing ties to the motion: those that are 1 and were 0 have just
+    been forgotten.
     """
     m = views(floats, integers)
     w = work_views(m.work, len(m.P))
@@ -90,7 +91,7 @@ def filter_until_keyframe(
             if not tracked or m.counters[RESTARTS] != restarts:
                 cursor[KEYFRAME_NS] = m.counters[NOW]
                 return STARTED
-            if jumped or m.counters[NOW] - cursor[KEYFRAME_NS] >= spacing_ns:
+            if jumped or kinds[j] == ODOMETRY_STEP or m.counters[NOW] - cursor[KEYFRAME_NS] >= spacing_ns:
                 cursor[KEYFRAME_NS] = m.counters[NOW]
                 return KEYFRAME
             continue

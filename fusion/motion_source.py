@@ -42,7 +42,7 @@ def motion_source(
     """
     kind = options.motion
     if kind == "auto":
-        kind = _best_of(log, options)
+        kind = _best_of(log)
     if kind == "imu+odometry":
         _odometry_of(log)
         return replace(_imu(log, calibration, options), kind=kind)
@@ -57,10 +57,10 @@ def motion_source(
     return MotionSource("constant-velocity", _nothing_measured(stamps_ns, options), _smooth(options), body)
 
 
-def _best_of(log: Log, options: FuseOptions) -> Kind:
+def _best_of(log: Log) -> Kind:
     odometry = log.T_odom_cam is not None and len(log.T_odom_cam) > 1
     if log.imu is not None:
-        return "imu+odometry" if odometry and options.estimator == "eskf" else "imu"
+        return "imu+odometry" if odometry else "imu"
     return "odometry" if odometry else "constant-velocity"
 
 

@@ -287,10 +287,11 @@ class FuseOptions:
     measurements: Literal["camera", "objects"] = "objects"
     """camera: the solver's (or the log's own) camera poses; objects: each object's pose directly."""
     motion: Literal["auto", "imu", "odometry", "imu+odometry", "constant-velocity"] = "auto"
-    """What carries the state between measurements; auto: the IMU, for the eskf with the log's odometry
-    beside it, else the odometry, else constant velocity.
+    """What carries the state between measurements; auto: the IMU, with the log's odometry beside it where there is
+    one, else the odometry, else constant velocity.
 
-    imu+odometry (eskf): the IMU carries it, and the odometry's relative poses are measurements against a cloned pose.
+    imu+odometry: the IMU carries it, and the odometry's relative poses are measurements: against a cloned pose in the
+    eskf, between keyframes in the graph.
     """
     noise: DetectionNoise = field(default_factory=DetectionNoise)
     camera_noise: CameraNoise = field(default_factory=CameraNoise)

@@ -71,8 +71,6 @@ def pose_problem(
         measured = object_measurements(detections, log.landmark_map, calibration, options)
     source = motion_source(log, calibration, options, measured.stamps_ns)
     if source.kind == "imu+odometry":
-        if options.estimator != "eskf":
-            raise InputError("the graph moves by the IMU or by odometry, not by both", fix="choose another --motion")
         layout = replace(layout, clone=True)
         measured = Measurements.merged(odometry_steps(log, calibration, options), measured)
     if source.kind not in WITH_IMU and options.estimate.gravity:

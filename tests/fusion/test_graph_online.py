@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from filter_runs import simulated
+from scipy.spatial.transform import Rotation
 
 from fusion.graph import run_graph
 from fusion.graph_online import GraphEstimator
@@ -33,9 +34,10 @@ class Feed:
     def pose(self, j):
         m = self.problem.measurements
         stamp = int(m.stamps_ns[j]) - time_shift_ns(self.problem.calibration)
-        rows = slice(j, j + 1)
-        columns = m.rotations[rows], m.translations[rows], m.covariances[rows]
-        self.estimator._feed_poses(stamp, int(m.kinds[j]), m.objects[rows], *columns)
+        q = Rotation.from_matrix(m.rotations[j].reshape(3, 3)).as_quat()
+        columns = m.translations[j : j + 1], q[None], m.covariances[j : j + 1]
+        object_id, instance = self.problem.keys[m.objects[j]]
+        self.estimator.feed_object_poses(stamp, [object_id], *columns, instances=[instance])
 
     def all(self, delays_ns, states_from=np.inf):
         """Feed everything by time of arrival; return the states at the samples."""

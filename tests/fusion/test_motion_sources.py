@@ -96,7 +96,7 @@ def test_a_log_without_imu_is_fused(log, motion):
 
 def test_auto_takes_the_best_there_is_and_says_so(log):
     assert fuse(log).motion == "imu+odometry"
-    assert fuse(log, FuseOptions(estimator="graph")).motion == "imu"
+    assert fuse(log, FuseOptions(estimator="graph")).motion == "imu+odometry"
     assert fuse(replace(log, T_odom_cam=None)).motion == "imu"
     assert fuse(replace(log, imu=None)).motion == "odometry"
     assert fuse(replace(log, imu=None, T_odom_cam=None)).motion == "constant-velocity"
@@ -131,12 +131,10 @@ def test_odometry_beside_the_imu_holds_the_drift_of_a_gap():
     assert np.mean(nees) < 3.0
 
 
-def test_odometry_beside_the_imu_is_smoothed_and_not_for_the_graph(log):
+def test_odometry_beside_the_imu_is_smoothed_and_must_be_there(log):
     options = FuseOptions(motion="imu+odometry")
     gap = blinded(log, 6.0, 10.0)
     assert rmse(fuse(gap, replace(options, smooth=True)), log) < rmse(fuse(gap, options), log)
-    with pytest.raises(InputError, match="graph"):
-        fuse(log, replace(options, estimator="graph"))
     with pytest.raises(InputError, match=r"T_odom_cam\.tum"):
         fuse(replace(log, T_odom_cam=None), options)
 
