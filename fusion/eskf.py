@@ -402,8 +402,10 @@ def fades(x: Array, b: int, first: int, kind: int, bias_model: Array) -> bool:
 
 
 @njit(cache=True)
-def forget_bias(x: Array, P: Array, k: int, first: int, bias_model: Array, layout: Ints, kind: int) -> None:
-    """Forget an object's bias of rotation (first 0) or translation (3); kind 0, the varying one, has jumped.
+def forget_bias(
+    x: Array, P: Array, k: int, first: int, bias_model: Array, layout: Ints, kind: int, jumped: bool
+) -> None:
+    """Forget an object's bias of rotation (first 0) or translation (3).
 
     Its mean becomes zero again and its sigma, if it jumped, a multiple of the stationary one; what it knew of other
     states is dropped.
@@ -414,7 +416,7 @@ def forget_bias(x: Array, P: Array, k: int, first: int, bias_model: Array, layou
         x[b + i] = 0.0
         for j in range(n):
             P[at + i, j] = P[j, at + i] = 0.0
-        scale = bias_model[BIAS_JUMP] if kind == 0 else 1.0
+        scale = bias_model[BIAS_JUMP] if jumped else 1.0
         P[at + i, at + i] = (scale * bias_sigma(bias_model, kind, i)) ** 2
 
 

@@ -39,6 +39,7 @@ from fusion.eskf import (
 )
 from fusion.imu import propagate_covariance, propagate_nominal, transition_blocks, write_gravity_basis
 from fusion.measurements import OBJECT_POSE, ODOMETRY_STEP, camera_in_world, residual_and_jacobian
+from fusion.meeting import PUT, START_AGAIN, UNKNOWN_MAP, choose_anchor, forget_rivals, suppose
 from fusion.memory import (
     BIAS_TIME,
     CLONED,
@@ -48,6 +49,7 @@ from fusion.memory import (
     MODE,
     NOW,
     REFUSED_ROW,
+    REPLACED,
     RESTARTS,
     STARTED_AT,
     TRACKING,
@@ -61,7 +63,6 @@ from fusion.memory import (
 from fusion.nav_state import (
     AT_BIASES,
     AT_GRAVITY,
-    AT_OBJECTS,
     BIASES,
     EXTRINSIC_POSITION,
     EXTRINSIC_ROTATION,
@@ -80,7 +81,7 @@ from fusion.nav_state import (
     Ints,
 )
 from fusion.odometry import IS_ODOMETRY, move_by_odometry, spread_by_odometry
-from fusion.place_watch import ON_MAP, RELEASE, RELEASED, TURNED, forget_places, status_of, tally, watch
+from fusion.place_watch import ON_MAP, RELEASE, RELEASED, TURNED, forget_places, return_to_map, status_of, tally, watch
 from fusion.so3_kernels import (
     apply,
     multiply,
@@ -235,6 +236,8 @@ def measure(
     if odometry < first == last:
         _clone(m)
         return
+    if m.meeting[UNKNOWN_MAP] > 0.0:
+        choose_anchor(m, kinds, objects, first, last)
     accepted = False
     for j in range(first, last):
         decisions[j] = PENDING if c[MODE] == TRACKING else REJECTED
@@ -249,6 +252,11 @@ def measure(
             if decisions[j] == REJECTED:  # refused before the others had moved the state: ask again
                 k, R_m, t_m = objects[j], rotations[j], translations[j]
                 decisions[j] = _update(m, w, kinds[j], k, R_m, t_m, covariances[j], rate, nis[j], True)
+        for j in range(first, last if len(m.supposed) > 0 else first):
+            k, R_m, t_m = objects[j], rotations[j], translations[j]
+            if kinds[j] == OBJECT_POSE and meet(m, w, k, R_m, t_m, rate) == PUT:
+                _put_object(m, w, k, R_m, t_m, covariances[j], rate)
+                decisions[j] = ACCEPTED
     account(m, w, first, last, kinds, objects, rotations, translations, covariances, rate, decisions, nis)
     if c[MODE] == INITIALISING:
         _try_to_start(m, w)
@@ -256,6 +264,28 @@ def measure(
         _restart_if_lost(m, w)
     if odometry < first and c[MODE] == TRACKING:
         _clone(m)
+
+
+@njit(cache=True)
+def meet(m: Memory, w: Work, k: int, rotation: Array, translation: Array, rate: Array) -> int:
+    """Take a detection into where its object may be; return PUT where it is to be put where this detection sees it.
+
+    Where another pose of the object that anchors the world has come to lead, the world is moved so that this one is
+    where the map says, and all other objects are unknown again.
+    """
+    found = suppose(m, w, k, rotation, translation, rate, m.limits[NOMINAL_OFFSET])
+    if found == PUT and m.known[k] > 0.0:
+        m.counters[REPLACED] += 1
+        return_to_map(m, k)
+    if found == START_AGAIN:
+        m.inliers[:] = 0
+        _adopt(m, w, GYRO_BIAS_ERROR)
+        for i in range(m.layout[N_OBJECTS]):
+            m.known[i] = 1.0 if i == k else 0.0
+        forget_rivals(m, True)
+        m.counters[RESTARTS] += 1
+        m.counters[STARTED_AT] = m.counters[NOW]
+    return found
 
 
 @njit(cache=True)
@@ -301,15 +331,15 @@ def account(
         if kinds[j] != OBJECT_POSE or m.known[k] == 0.0:
             continue
         if watch(m, w, k, rotations[j], translations[j], covariances[j], rate, m.limits[NOMINAL_OFFSET]) != 0:
-            _forget_biases(m, k)
+            _forget_biases(m, k, True)
 
 
 @njit(cache=True)
-def _forget_biases(m: Memory, k: int) -> None:
-    """Forget every bias of an object that leaves its place in the map or returns to it."""
+def _forget_biases(m: Memory, k: int, jumped: bool) -> None:
+    """Forget every bias of an object that is put elsewhere; where its detections jumped, the varying one has too."""
     for kind in range(m.layout[N_BIAS_KINDS]):
         for first in (0, 3):
-            forget_bias(m.x, m.P, k, first, m.bias_model, m.layout, kind)
+            forget_bias(m.x, m.P, k, first, m.bias_model, m.layout, kind, jumped and kind == 0)
             if len(m.tape) > 0:
                 note_forgetting(m, k + kind * m.layout[N_OBJECTS], first)
     m.refused[k, 0] = m.refused[k, 1] = 0.0
@@ -378,7 +408,7 @@ def _update(
             w.R[i, j] = covariance[i, j] * scale
     if kind == OBJECT_POSE and m.known[k] == 0.0:
         nis[0] = np.inf
-        return _meet_object(m, w, k, R_m, t_m, rate) if correcting else REJECTED
+        return REJECTED
     if kind == OBJECT_POSE and m.orders[k] != 1:
         _fit_object_symmetry(m, w, k, R_m, rate)
     count = residual_and_jacobian(
@@ -401,10 +431,11 @@ def _update(
 
 
 @njit(cache=True)
-def _meet_object(m: Memory, w: Work, k: int, R_m: Array, t_m: Array, rate: Array) -> int:
-    """Place an object whose pose in the world is unknown where its first detection sees it."""
-    if m.layout[AT_OBJECTS] < 0:
-        return REJECTED
+def _put_object(m: Memory, w: Work, k: int, R_m: Array, t_m: Array, covariance: Array, rate: Array) -> None:
+    """Put an object whose pose in the world is unknown where a detection sees it."""
+    for i in range(6):
+        for j in range(6):
+            w.R[i, j] = covariance[i, j] * m.scales[k]
     R_wi, R_wc, p_wi, away = w.step[0:9], w.step[9:18], w.step[18:21], w.step[30:33]
     camera_in_world(m.x, m.x[TIME_OFFSET] - m.limits[NOMINAL_OFFSET], rate, R_wi, p_wi, R_wc, w.step[21:30])
     at = OBJECTS + OBJECT_SIZE * k
@@ -414,11 +445,7 @@ def _meet_object(m: Memory, w: Work, k: int, R_m: Array, t_m: Array, rate: Array
     apply(R_wi, p_ic[0], p_ic[1], p_ic[2], w.step[33:36])
     for i in range(3):
         m.x[at + 9 + i] = p_wi[i] + w.step[33 + i] + away[i]
-    if m.layout[N_BIAS_KINDS] > 0:
-        for first in (0, 3):
-            forget_bias(m.x, m.P, k, first, m.bias_model, m.layout, 0)
-            if len(m.tape) > 0:
-                note_forgetting(m, k, first)
+    _forget_biases(m, k, False)
     count = residual_and_jacobian(
         OBJECT_POSE, k, R_m, t_m, m.x, rate, m.limits[NOMINAL_OFFSET], m.layout, w.residual, w.H, m.columns, w.step
     )
@@ -426,7 +453,6 @@ def _meet_object(m: Memory, w: Work, k: int, R_m: Array, t_m: Array, rate: Array
     m.known[k] = 1.0
     if len(m.tape) > 0:
         note_meeting(m, w, k, count)
-    return ACCEPTED
 
 
 @njit(cache=True)
@@ -438,7 +464,7 @@ def _follow_jumps(m: Memory, kind: int, k: int, decision: int) -> None:
         used = decision & (POSITION_ONLY if part == 1 else ROTATION_ONLY)
         m.refused[k, part] = 0.0 if used else m.refused[k, part] + 1.0
         if m.refused[k, part] >= m.limits[JUMP_AFTER]:
-            forget_bias(m.x, m.P, k, 3 * part, m.bias_model, m.layout, 0)
+            forget_bias(m.x, m.P, k, 3 * part, m.bias_model, m.layout, 0, True)
             if len(m.tape) > 0:
                 note_forgetting(m, k, 3 * part)
             m.refused[k, part] = 0.0
@@ -605,6 +631,7 @@ def _adopt(m: Memory, w: Work, keep_from: int) -> None:
         m.P[at + i, at + i] = bias_sigma(m.bias_model, kind, component) ** 2
     m.counters[BIAS_TIME], m.counters[CLONED] = m.counters[NOW], 0
     forget_places(m)
+    forget_rivals(m, False)
     # The agreeing votes count as used, so that a restart is not followed by the next at once.
     for a in range(len(m.inliers)):
         if m.inliers[a]:

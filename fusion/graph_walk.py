@@ -14,7 +14,7 @@ from fusion.eskf import fit_symmetry
 from fusion.filter_loop import advance, angular_velocity_at, begin, emit, measure
 from fusion.fuse import loop_columns
 from fusion.measurements import OBJECT_POSE, ODOMETRY_STEP, camera_in_world
-from fusion.memory import MODE, NOW, RESTARTS, TRACKING, Memory, Work, views, work_views
+from fusion.memory import MODE, NOW, REPLACED, RESTARTS, TRACKING, Memory, Work, views, work_views
 from fusion.nav_state import AT_BIASES, N_BIAS_KINDS, N_OBJECTS, OBJECT_SIZE, OBJECTS, TIME_OFFSET, Array, Ints
 from fusion.options import FuseOptions
 from fusion.prepare import Problem, fill_memory
@@ -60,7 +60,8 @@ def filter_until_keyframe(
     out_sigma: Array,
     out_covariance: Array,
 ) -> int:
-    """Filter up to the next keyframe and return KEYFRAME, STARTED where the filter (re)started there, or END.
+    """Filter up to the next keyframe and return KEYFRAME, STARTED where the filter (re)started or put an object
+    elsewhere there, or END.
 
     A keyframe is due at the first stamp with measurements spacing_ns after the last one, where an object's bias jumped,
     wherever odometry is measured, and at an IMU sample idle_ns after the last one. Its own measurements are taken in.
@@ -74,7 +75,7 @@ def filter_until_keyframe(
     while cursor[IMU_ROW] < len(imu_stamps):
         k, j = cursor[IMU_ROW], cursor[NEXT]
         if j < len(stamps) and stamps[j] <= imu_stamps[k]:
-            last, restarts, tracked = j, m.counters[RESTARTS], m.counters[MODE] == TRACKING
+            last, restarts, tracked = j, m.counters[RESTARTS] + m.counters[REPLACED], m.counters[MODE] == TRACKING
             while last < len(stamps) and stamps[last] == stamps[j]:
                 last += 1
             advance(m, w, imu_stamps, imu_values, stamps[j])
@@ -88,7 +89,7 @@ def filter_until_keyframe(
                 fitted = fitted_rotations[i], fitted_covariances[i]
                 _keep_fitted(m, w, kinds[i], objects[i], rotations[i], covariances[i], rate, fitted[0], fitted[1])
             jumped = _find_fresh(m, fresh)
-            if not tracked or m.counters[RESTARTS] != restarts:
+            if not tracked or m.counters[RESTARTS] + m.counters[REPLACED] != restarts:
                 cursor[KEYFRAME_NS] = m.counters[NOW]
                 return STARTED
             if jumped or kinds[j] == ODOMETRY_STEP or m.counters[NOW] - cursor[KEYFRAME_NS] >= spacing_ns:

@@ -32,11 +32,14 @@ VOTES = 256  # a second of eight objects at 30 Hz; a power of two, so that place
     TAPE_END,
     REFUSED_ROW,
     CLONED,  # 1 where the clone is that of the last odometry
+    REPLACED,  # how often an object of an unknown map was put elsewhere
+    ANCHOR,  # 1 + the object that anchors a world whose map is unknown, 0: none yet
     N_COUNTERS,
-) = range(13)
+) = range(15)
 INITIALISING, TRACKING = 0, 1
 
 TALLY_SIZE, PLACE_SIZE = 8, 15  # rows of tallies and places, see place_watch.py
+SUPPOSED, SUPPOSED_SIZE = 6, 16  # hypotheses of each unknown object's pose, see meeting.py
 
 # Integer header: where things stand in the float buffer, sizes.
 (
@@ -47,6 +50,7 @@ TALLY_SIZE, PLACE_SIZE = 8, 15  # rows of tallies and places, see place_watch.py
     AT_KNOWN,
     AT_TALLIES,
     AT_PLACES,
+    AT_SUPPOSED,
     AT_UP,
     END_OF_STATE,
     AT_NOISE,
@@ -54,6 +58,7 @@ TALLY_SIZE, PLACE_SIZE = 8, 15  # rows of tallies and places, see place_watch.py
     AT_START,
     AT_BIAS_MODEL,
     AT_MOVED,
+    AT_MEETING,
     AT_AXES,
     AT_PRIOR,
     AT_WORK,
@@ -62,6 +67,7 @@ TALLY_SIZE, PLACE_SIZE = 8, 15  # rows of tallies and places, see place_watch.py
     H_N,
     H_NX,
     H_K,
+    H_SUPPOSED,
     AT_LAYOUT,
     AT_COUNTERS,
     AT_ORDERS,
@@ -71,7 +77,7 @@ TALLY_SIZE, PLACE_SIZE = 8, 15  # rows of tallies and places, see place_watch.py
     AT_TAPE,
     TAPE_SIZE,
     HEADER,
-) = range(31)
+) = range(34)
 
 
 class Memory(NamedTuple):
@@ -84,12 +90,14 @@ class Memory(NamedTuple):
     known: Array  # (K,) 1 where an object's pose in the world is known, 0 before it was first seen
     tallies: Array  # (K + 1, .) how the measurements of each object, and camera poses, fared: places in place_watch.py
     places: Array  # (K, .) where each object stands against the map: places in place_watch.py
+    supposed: Array  # (K, SUPPOSED, .) where an object of unknown pose may be: places in meeting.py; or (0, ..)
     up: Array  # (3,) running mean of the specific force in the axes of the integrated motion
     noise: Array  # of the motion: places in imu.py and odometry.py
     limits: Array  # places: filter_loop.LIMIT_BOTH and following
     start: Array
     bias_model: Array
     moved: Array  # when an object counts as moved: places in place_watch.py
+    meeting: Array  # when an object of unknown pose is put where it is seen: places in meeting.py
     axes: Array  # (K, 3) symmetry axes
     prior: Array  # (n,) 1-sigma of the error state at the start
     work: Array
@@ -108,7 +116,7 @@ def allocate(layout: StateLayout) -> tuple[Array, Ints]:
     """Return the zeroed buffers of a filter with this layout; `views` gives their parts names."""
     n, nx, K = layout.n_error, layout.n_nominal, layout.n_objects
     header = np.zeros(HEADER, dtype=np.int64)
-    header[H_N], header[H_NX], header[H_K] = n, nx, K
+    header[H_N], header[H_NX], header[H_K], header[H_SUPPOSED] = n, nx, K, K if layout.objects else 0
     sizes: Sequence[tuple[int, int]] = (
         (AT_X, nx),
         (AT_P, n * n),
@@ -117,6 +125,7 @@ def allocate(layout: StateLayout) -> tuple[Array, Ints]:
         (AT_KNOWN, max(K, 1)),
         (AT_TALLIES, TALLY_SIZE * (max(K, 1) + 1)),
         (AT_PLACES, PLACE_SIZE * max(K, 1)),
+        (AT_SUPPOSED, SUPPOSED * SUPPOSED_SIZE * header[H_SUPPOSED]),
         (AT_UP, 3),
         (END_OF_STATE, 0),
         (AT_NOISE, 12),
@@ -124,6 +133,7 @@ def allocate(layout: StateLayout) -> tuple[Array, Ints]:
         (AT_START, 16),
         (AT_BIAS_MODEL, 14),
         (AT_MOVED, 12),
+        (AT_MEETING, 8),
         (AT_AXES, 3 * max(K, 1)),
         (AT_PRIOR, n),
         (AT_WORK, work_size(n)),
@@ -193,12 +203,14 @@ def views(floats: Array, integers: Ints) -> Memory:
         f[i[AT_KNOWN] : i[AT_KNOWN] + K],
         f[i[AT_TALLIES] : i[AT_TALLIES] + TALLY_SIZE * (K + 1)].reshape((K + 1, TALLY_SIZE)),
         f[i[AT_PLACES] : i[AT_PLACES] + PLACE_SIZE * K].reshape((K, PLACE_SIZE)),
+        f[i[AT_SUPPOSED] : i[AT_UP]].reshape((i[H_SUPPOSED], SUPPOSED, SUPPOSED_SIZE)),
         f[i[AT_UP] : i[AT_UP] + 3],
         f[i[AT_NOISE] : i[AT_NOISE] + 12],
         f[i[AT_LIMITS] : i[AT_LIMITS] + 12],
         f[i[AT_START] : i[AT_START] + 16],
         f[i[AT_BIAS_MODEL] : i[AT_BIAS_MODEL] + 14],
         f[i[AT_MOVED] : i[AT_MOVED] + 12],
+        f[i[AT_MEETING] : i[AT_MEETING] + 8],
         f[i[AT_AXES] : i[AT_AXES] + 3 * K].reshape((K, 3)),
         f[i[AT_PRIOR] : i[AT_PRIOR] + n],
         f[i[AT_WORK] : i[AT_WORK] + work_size(n)],

@@ -116,6 +116,31 @@ class Moved:
 
 
 @dataclass(frozen=True)
+class Meeting:
+    """Where an object of an unknown map is put: at a pose that its detections agree on.
+
+    Every pose that it may have is kept with the number of detections that showed it, also after one was chosen: a first
+    sight that was flipped or grossly wrong is outnumbered later.
+    """
+
+    min_poses: int = 8
+    """So many detections must agree on a pose"""
+    min_span_s: float = 0.3
+    """over so long a time, s,"""
+    lead: float = 1.5
+    """and be so many times as many as those on any other pose."""
+    max_angle_deg: float = 15.0
+    """Detections agree within this angle, deg,"""
+    max_distance: float = 0.05
+    """and this distance, m,"""
+    max_lever: float = 0.08
+    """plus this share of the object's distance."""
+    replace: bool = True
+    """Put an object elsewhere when another pose has come to lead by as much; where it is the one that anchors the
+    world, start again, all others unknown."""
+
+
+@dataclass(frozen=True)
 class HealthOptions:
     """When an estimator is called coasting or lost."""
 
@@ -298,6 +323,7 @@ class FuseOptions:
     bias: DetectionBias = field(default_factory=DetectionBias)
     gate: Gate = field(default_factory=Gate)
     moved: Moved = field(default_factory=Moved)
+    meeting: Meeting = field(default_factory=Meeting)
     health: HealthOptions = field(default_factory=HealthOptions)
     start: Start = field(default_factory=Start)
     prior: Prior = field(default_factory=Prior)

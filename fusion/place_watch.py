@@ -90,6 +90,12 @@ def forget_places(m: Memory) -> None:
 
 
 @njit(cache=True)
+def return_to_map(m: Memory, k: int) -> None:
+    """Watch an object anew at the place where it has just been put."""
+    _look_anew(m.places[k], ON_MAP)
+
+
+@njit(cache=True)
 def watch(
     m: Memory, w: Work, k: int, rotation: Array, translation: Array, covariance: Array, rate: Array, offset: float
 ) -> int:

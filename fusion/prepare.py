@@ -10,7 +10,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from fusion import consensus, eskf, filter_loop, imu, memory, odometry, place_watch
+from fusion import consensus, eskf, filter_loop, imu, meeting, memory, odometry, place_watch
 from fusion.measurements import CAMERA_POSE, OBJECT_POSE, Measurements, ray_aligned_covariance
 from fusion.motion_source import Kind, motion_source, odometry_steps
 from fusion.nav_state import ACCEL_BIAS_ERROR, CORE, GYRO_BIAS_ERROR, VELOCITY_ERROR, StateLayout, nominal_state
@@ -208,14 +208,15 @@ def fill_memory(problem: Problem, options: FuseOptions) -> tuple[Array, NDArray[
     steady[eskf.BIAS_ROTATION] = math.radians(bias.steady_rotation_deg)
     steady[[eskf.BIAS_ACROSS, eskf.BIAS_ALONG, eskf.BIAS_TAU]] = bias.steady_across, bias.steady_along, math.inf
     m.moved[: place_watch.MIN_POSES + 1] = _moved(options)
+    m.meeting[: meeting.REPLACE + 1] = _meeting(options)
     m.prior[:] = _prior(layout, options)
     _without_imu(problem, options, m)
     if landmark_map is not None and layout.objects and options.estimate.map == "approximate":
         _map_prior(landmark_map, layout, m.prior)
     m.known[:] = 1.0
     if options.estimate.map == "unknown" and layout.n_objects:
+        _check_anchor(problem)
         m.known[:] = 0.0
-        m.known[_anchor(problem)] = 1.0
     if landmark_map is not None and layout.n_objects:
         for k, landmark in enumerate(landmark_map):
             if landmark.symmetry is not None:
@@ -251,16 +252,12 @@ def _map_prior(landmark_map: LandmarkMap, layout: StateLayout, sigma: Array) -> 
             sigma[layout.error_slice("objects", k)] = np.sqrt(variances)
 
 
-def _anchor(problem: Problem) -> int:
-    """Return the landmark that anchors a world whose map is unknown: the first one seen without a symmetry.
-
-    Raises InputError where there is none.
-    """
+def _check_anchor(problem: Problem) -> None:
+    """Raise InputError where no object could anchor a world whose map is unknown (`meeting.choose_anchor`)."""
     landmarks = [] if problem.landmark_map is None else list(problem.landmark_map)
-    for k in problem.measurements.objects[problem.measurements.kinds == OBJECT_POSE]:
-        if landmarks[k].symmetry is None:
-            return int(k)
-    raise InputError("no object without symmetry is seen, so none can anchor the world", path=problem.path)
+    seen = np.unique(problem.measurements.objects[problem.measurements.kinds == OBJECT_POSE])
+    if len(seen) and all(landmarks[k].symmetry is not None for k in seen):
+        raise InputError("no object without symmetry is seen, so none can anchor the world", path=problem.path)
 
 
 def _limits(options: FuseOptions) -> list[float]:
@@ -313,6 +310,21 @@ def _moved(options: FuseOptions) -> list[float]:
         place_watch.MIN_OTHERS: moved.min_others,
         place_watch.MEMORY_S: moved.memory_s,
         place_watch.MIN_POSES: moved.min_poses,
+    }
+    return [float(values[i]) for i in range(len(values))]
+
+
+def _meeting(options: FuseOptions) -> list[float]:
+    chosen = options.meeting
+    values = {
+        meeting.UNKNOWN_MAP: options.estimate.map == "unknown",
+        meeting.MIN_POSES: chosen.min_poses,
+        meeting.MIN_SPAN_S: chosen.min_span_s,
+        meeting.LEAD: chosen.lead,
+        meeting.MAX_ANGLE: math.radians(chosen.max_angle_deg),
+        meeting.MAX_DISTANCE: chosen.max_distance,
+        meeting.MAX_LEVER: chosen.max_lever,
+        meeting.REPLACE: chosen.replace and options.estimate.map == "unknown",
     }
     return [float(values[i]) for i in range(len(values))]
 

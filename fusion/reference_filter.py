@@ -24,10 +24,10 @@ from fusion.eskf import (
     REJECTED,
     ROTATION_ONLY,
     bias_sigma,
-    forget_bias,
 )
 from fusion.fuse import run_filter
 from fusion.measurements import OBJECT_POSE, ODOMETRY_STEP
+from fusion.meeting import PUT, UNKNOWN_MAP, choose_anchor
 from fusion.nav_state import (
     EXTRINSIC_ROTATION,
     GYRO_BIAS,
@@ -183,7 +183,7 @@ class ReferenceFilter:
             R = R * m.scales[k]
             if not m.known[k]:
                 nis[0] = np.inf
-                return self._meet_object(k, R_m, t_m, R, rate) if correcting else REJECTED
+                return REJECTED
             if m.orders[k] != 1:
                 R_m, R = self._fit_symmetry(k, R_m, R, rate)
         offset = m.limits[filter_loop.NOMINAL_OFFSET]
@@ -215,22 +215,19 @@ class ReferenceFilter:
         m.x[start : start + 12] = m.x[:12]
         m.counters[memory.CLONED] = 1
 
-    def _meet_object(self, k: int, R_m: Array, t_m: Array, R: Array, rate: Array) -> int:
-        """Place an object whose pose in the world is unknown where its first detection sees it.
+    def _put_object(self, k: int, R_m: Array, t_m: Array, R: Array, rate: Array) -> None:
+        """Put an object whose pose in the world is unknown where a detection sees it.
 
         With 0 = H_x dx + H_o do + e its error is do = -H_o^-1 (H_x dx + e).
         """
         m, layout, x = self.m, self.layout, self.m.x
-        if not layout.objects:
-            return REJECTED
         offset, at = m.limits[filter_loop.NOMINAL_OFFSET], OBJECTS + OBJECT_SIZE * k
         T_world_imu = make_pose(
             Rotation.from_matrix(x[:9].reshape(3, 3) @ exp((x[TIME_OFFSET] - offset) * rate)),
             x[POSITION : POSITION + 3] + (x[TIME_OFFSET] - offset) * x[VELOCITY : VELOCITY + 3],
         )
         put_pose(x, at, T_world_imu * pose_at(x, EXTRINSIC_ROTATION) * make_pose(Rotation.from_matrix(R_m), t_m))
-        for first in (0, 3) if layout.bias_kinds else ():
-            forget_bias(x, m.P, k, first, m.bias_model, m.layout, 0)
+        filter_loop._forget_biases(m, k, False)
         _, H = residual_and_jacobian(OBJECT_POSE, k, R_m, t_m, x, rate, offset, layout)
         rows = layout.error_slice("objects", k)
         inverse = np.linalg.inv(H[:, rows])
@@ -239,7 +236,6 @@ class ReferenceFilter:
         A[rows], Q[rows, rows] = -inverse @ H, inverse @ R @ inverse.T
         self.spread(A, Q)
         m.known[k] = 1.0
-        return ACCEPTED
 
     def _fit_symmetry(self, k: int, R_m: Array, R: Array, rate: Array) -> tuple[Array, Array]:
         """Turn a measured rotation to the look-alike that fits best; a continuous symmetry says nothing of its turn."""
@@ -276,12 +272,19 @@ class ReferenceFilter:
             if self.tracking:
                 self.clone()
             return
+        if m.meeting[UNKNOWN_MAP]:
+            choose_anchor(m, kinds, measured[1], first, last)
         if self.tracking:
             for j in self.order(first, last, measured, rate, nis):
                 decisions[j] = self.take(measured, j, rate, nis[j])
             for j in range(first, last if (decisions[first:last] & ACCEPTED).any() else first):
                 if decisions[j] == REJECTED:  # refused before the others had moved the state: ask again
                     decisions[j] = self.take(measured, j, rate, nis[j])
+            for j in range(first, last if len(m.supposed) else first):
+                k, R_m, t_m = measured[1][j], measured[2][j], measured[3][j]
+                if kinds[j] == OBJECT_POSE and filter_loop.meet(m, self.work, k, R_m, t_m, rate) == PUT:
+                    self._put_object(k, R_m.reshape(3, 3), t_m, measured[4][j] * m.scales[k], rate)
+                    decisions[j] = ACCEPTED
         filter_loop.account(m, self.work, first, last, *measured, rate, decisions, nis)
         if self.tracking:
             filter_loop._restart_if_lost(m, self.work)
