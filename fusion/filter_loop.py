@@ -43,9 +43,12 @@ from fusion.meeting import PUT, START_AGAIN, UNKNOWN_MAP, choose_anchor, forget_
 from fusion.memory import (
     BIAS_TIME,
     CLONED,
+    DELAY,
     IMU_AT,
     INITIALISING,
+    LAST_STAMP,
     LAST_UPDATE,
+    LEAST_DELAY,
     MODE,
     NOW,
     REFUSED_ROW,
@@ -63,6 +66,7 @@ from fusion.memory import (
 from fusion.nav_state import (
     AT_BIASES,
     AT_GRAVITY,
+    AT_TIME_OFFSET,
     BIASES,
     EXTRINSIC_POSITION,
     EXTRINSIC_ROTATION,
@@ -108,6 +112,8 @@ PENDING = -1  # beside the decisions of the gate
 
 OUT_CORE, OUT_SIGMA, OUT_COVARIANCE = 21, 15, 36
 
+RETIMED_BEYOND_NS = 1_000_000
+
 
 @njit(cache=True)
 def begin(m: Memory, stamp: int, specific_force: Array, imu_index: int) -> None:
@@ -127,6 +133,7 @@ def begin(m: Memory, stamp: int, specific_force: Array, imu_index: int) -> None:
     m.up[0], m.up[1], m.up[2] = 0.0, 0.0, 1.0
     c = m.counters
     c[NOW], c[IMU_AT], c[MODE], c[BIAS_TIME], c[UP_COUNT] = stamp, imu_index, INITIALISING, stamp, 0
+    c[LAST_STAMP] = stamp - 1
 
 
 @njit(cache=True)
@@ -153,7 +160,9 @@ def advance(m: Memory, w: Work, imu_stamps: Ints, imu_values: Array, until: int)
                 write_gravity_basis(m.x, w.basis)
             propagate_nominal(m.x, dt, rate, force, w.step)
             transition_blocks(dt, w.step, w.blocks)
-            propagate_covariance(m.P, w.blocks, dt, (end - start) * 1e-9, m.noise, w.basis, m.layout, w.core, w.rows)
+            propagate_covariance(
+                m.P, w.blocks, dt, (end - start) * 1e-9, m.noise, imu_values[k + 1], w.basis, m.layout, w.core, w.rows
+            )
             if len(m.tape) > 0:
                 note_step(m, w, dt)
         else:
@@ -162,6 +171,60 @@ def advance(m: Memory, w: Work, imu_stamps: Ints, imu_values: Array, until: int)
         c[NOW] = stop
         if stop == end:
             c[IMU_AT] = k + 1
+
+
+@njit(cache=True)
+def due(m: Memory, stamp: int) -> int:
+    """Return when measurements of a stamp are taken in: as much later as the camera's clock is found to be early."""
+    if m.layout[AT_TIME_OFFSET] < 0 or m.counters[MODE] != TRACKING:
+        return stamp
+    return max(stamp + m.counters[DELAY], m.counters[NOW] + 1)
+
+
+@njit(cache=True)
+def measure_at(
+    m: Memory,
+    w: Work,
+    first: int,
+    last: int,
+    stamps: Ints,
+    kinds: Ints,
+    objects: Ints,
+    rotations: Array,
+    translations: Array,
+    covariances: Array,
+    imu_stamps: Ints,
+    imu_values: Array,
+    rate: Array,
+    decisions: Ints,
+    nis: Array,
+) -> None:
+    """Go to where the measurements first..last-1, all of one stamp, are due, and take them in."""
+    c = m.counters
+    advance(m, w, imu_stamps, imu_values, due(m, stamps[first]))
+    angular_velocity_at(m, imu_stamps, imu_values, rate)
+    m.limits[NOMINAL_OFFSET] = (c[NOW] - stamps[first]) * 1e-9
+    measure(m, w, first, last, kinds, objects, rotations, translations, covariances, rate, decisions, nis)
+    c[LAST_STAMP] = stamps[first]
+    retime(m)
+
+
+@njit(cache=True)
+def retime(m: Memory) -> None:
+    """Follow the estimated time offset, so that what is linear in it stays small.
+
+    What was learnt of it while it was far off came through a motion taken for uniform: its variance takes that back.
+    """
+    at = m.layout[AT_TIME_OFFSET]
+    if at < 0 or m.counters[MODE] != TRACKING:
+        return
+    error = round(m.x[TIME_OFFSET] * 1e9) - m.counters[DELAY]
+    if abs(error) <= RETIMED_BEYOND_NS:
+        return
+    m.counters[DELAY] += error
+    m.counters[LEAST_DELAY] = min(m.counters[LEAST_DELAY], m.counters[DELAY])
+    m.counters[CLONED] = 0  # odometry from before is of another clock
+    m.P[at, at] += (0.3e-9 * error) ** 2
 
 
 @njit(cache=True)
@@ -714,13 +777,12 @@ def run_part(
         begin(m, imu_stamps[0], imu_values[0, 3:6], 0)
     for k in range(first, end):
         emitted = False
-        while j < total and stamps[j] <= imu_stamps[k]:
+        while j < total and due(m, stamps[j]) <= imu_stamps[k]:
             last = j
             while last < total and stamps[last] == stamps[j]:
                 last += 1
-            advance(m, w, imu_stamps, imu_values, stamps[j])
-            angular_velocity_at(m, imu_stamps, imu_values, rate)
-            measure(m, w, j, last, kinds, objects, rotations, translations, covariances, rate, decisions, nis)
+            columns = (stamps, kinds, objects, rotations, translations, covariances)
+            measure_at(m, w, j, last, *columns, imu_stamps, imu_values, rate, decisions, nis)
             j = last
             if m.counters[MODE] == TRACKING:
                 emit(m, rows, out_stamps, out_core, out_sigma, out_covariance)

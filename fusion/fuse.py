@@ -15,6 +15,7 @@ from fusion import filter_loop, memory
 from fusion.calibrated import calibrated
 from fusion.eskf import POSITION_ONLY, ROTATION_ONLY
 from fusion.health import run_health
+from fusion.imu_noise import imu_rows
 from fusion.measurements import ODOMETRY_STEP, Measurements
 from fusion.options import FuseOptions
 from fusion.place_watch import RELEASED
@@ -113,7 +114,7 @@ def loop_columns(problem: Problem) -> LoopColumns:
     count, rows = len(measured), len(imu) + len(measured)
     return LoopColumns(
         imu.stamps_ns,
-        np.hstack([imu.angular_velocity, imu.specific_force]),
+        imu_rows(imu),
         measured.stamps_ns,
         measured.kinds,
         measured.objects,

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from fusion.graph_model import MOTION_SIZE, SHIFT, TURN, imu_between, motion_between, move, rate_at
 from fusion.graph_variables import GRAVITY_KEY, imu_bias, imu_bias_key, pose_key, velocity_key
+from fusion.imu_noise import ACCEL_SQUARES, GYRO_SQUARES, density_squared, imu_rows
 from fusion.nav_state import ACCEL_BIAS, GRAVITY, GYRO_BIAS
 from fusion.options import FuseOptions
 from fusion.prepare import Problem
@@ -29,7 +30,7 @@ class MotionChain:
 
     stamps_ns: Ints
     values: Array
-    """(N, 6) angular velocity and specific force, or odometry's twists."""
+    """(N, 9) angular velocity and specific force, or odometry's twists, and their noise (`imu_noise.imu_rows`)."""
     noise: ImuNoise
     options: FuseOptions
     with_imu: bool
@@ -39,9 +40,10 @@ class MotionChain:
     @classmethod
     def of(cls, problem: Problem, options: FuseOptions) -> MotionChain:
         """Return the chain of a problem."""
-        values = np.hstack([problem.imu.angular_velocity, problem.imu.specific_force])
         with_imu = problem.motion != "odometry"
-        return cls(problem.imu.stamps_ns, values, problem.imu_noise, options, with_imu, problem.layout.gravity)
+        return cls(
+            problem.imu.stamps_ns, imu_rows(problem.imu), problem.imu_noise, options, with_imu, problem.layout.gravity
+        )
 
     def motion(self, start: int, end: int, x: Array) -> Array:
         """Return the motion (MOTION_SIZE,) between two stamps at the biases in a nominal array."""
@@ -87,16 +89,21 @@ class MotionChain:
         biases = np.concatenate([bias.gyroscope(), bias.accelerometer()])
         longest = self.options.gap.longest_s
         count, gaps = imu_between(self.stamps_ns, self.values, start, end, biases, longest, steps)
-        summed = gtsam.PreintegratedCombinedMeasurements(self._parameters(gaps / ((end - start) * 1e-9), gravity), bias)
+        row = self.values[int(np.searchsorted(self.stamps_ns, end))]
+        summed = gtsam.PreintegratedCombinedMeasurements(
+            self._parameters(gaps / ((end - start) * 1e-9), row, gravity), bias
+        )
         for step in steps[:count]:
             summed.integrateMeasurement(step[4:7], step[1:4], step[0])
         return summed
 
-    def _parameters(self, gap_s: float, gravity: Array) -> gtsam.PreintegrationCombinedParams:
+    def _parameters(self, gap_s: float, row: Array, gravity: Array) -> gtsam.PreintegrationCombinedParams:
         """Every covariance is set: gtsam takes the identity for those that are not."""
         params, gap = gtsam.PreintegrationCombinedParams(gravity), self.options.gap
-        gyro = self.noise.gyroscope_noise_density**2 + gap_s * gap.angular_rate**2
-        accel = self.noise.accelerometer_noise_density**2 + gap_s * gap.acceleration**2
+        measured = float(self.options.imu.measured)
+        gyro = density_squared(self.noise.gyroscope_noise_density, row, GYRO_SQUARES, measured)
+        accel = density_squared(self.noise.accelerometer_noise_density, row, ACCEL_SQUARES, measured)
+        gyro, accel = gyro + gap_s * gap.angular_rate**2, accel + gap_s * gap.acceleration**2
         floor, identity = _SMALLEST_DENSITY**2, np.eye(3)
         params.setGyroscopeCovariance((gyro + floor) * identity)
         params.setAccelerometerCovariance((accel + floor) * identity)

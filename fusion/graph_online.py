@@ -27,6 +27,7 @@ from fusion.graph_builder import GraphBuilder
 from fusion.graph_motion import MotionChain
 from fusion.graph_smoother import FixedLagSmoother
 from fusion.graph_walk import IMU_ROW, NEXT, ROWS, Walk
+from fusion.imu_noise import REACH, follow_noise
 from fusion.measurements import Measurements
 from fusion.nav_state import StateLayout
 from fusion.online import Estimator, Health, OnlineOptions, empty_problem
@@ -104,7 +105,9 @@ class GraphEstimator(Estimator):
         else:
             if self._samples == len(self._room.imu_stamps):
                 self._trim()
-            self._room.imu_stamps[self._samples], self._room.imu_values[self._samples] = stamp, values
+            n = self._samples
+            self._room.imu_stamps[n], self._room.imu_values[n, :6] = stamp, values
+            follow_noise(self._room.imu_stamps, self._room.imu_values, n, n + 1)
             self._samples += 1
             self._run()
 
@@ -223,7 +226,7 @@ class GraphEstimator(Estimator):
             return
         room, oldest, imu_at = self._room, self._kept[0], int(self._walk.integers[memory.AT_COUNTERS]) + memory.IMU_AT
         since = oldest.now if oldest.smoother is None else min(oldest.now, oldest.smoother.builder.stamp_ns)
-        samples = max(0, int(np.searchsorted(room.imu_stamps[: self._samples], since)) - 2)
+        samples = max(0, int(np.searchsorted(room.imu_stamps[: self._samples], since)) - REACH)
         poses = int(oldest.cursor[NEXT]) if oldest.smoother is None else oldest.first
         for i, column in enumerate((*room[:10], self._rotations, self._covariances)):
             gone = samples if i < 2 else poses

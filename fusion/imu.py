@@ -12,6 +12,7 @@ from __future__ import annotations
 import numpy as np
 
 from fusion.compiled import njit
+from fusion.imu_noise import ACCEL_SQUARES, GYRO_SQUARES, density_squared
 from fusion.nav_state import (
     ACCEL_BIAS,
     ACCEL_BIAS_ERROR,
@@ -32,6 +33,7 @@ from fusion.so3_kernels import apply, exp_so3, left_jacobian, multiply, orthonor
 
 # Places in the noise array (densities in Kalibr's units, then the uncertainty of a bridged gap).
 GYRO_NOISE, ACCEL_NOISE, GYRO_WALK, ACCEL_WALK, GAP_S, GAP_RATE, GAP_ACCEL = range(7)
+MEASURED = 10  # 1 where the samples' own noise counts, behind those of odometry.py
 
 
 @njit(cache=True)
@@ -126,6 +128,7 @@ def propagate_covariance(
     dt: float,
     interval: float,
     noise: Array,
+    sample: Array,
     gravity_basis: Array,
     layout: Ints,
     core: Array,
@@ -151,18 +154,19 @@ def propagate_covariance(
             P[i, j] = P[j, i] = 0.5 * (core[i, j] + core[j, i])
         for j in range(GYRO_BIAS_ERROR, n):
             P[j, i] = P[i, j]
-    add_process_noise(P, dt, interval, noise)
+    add_process_noise(P, dt, interval, noise, sample)
 
 
 @njit(cache=True)
-def add_process_noise(P: Array, dt: float, interval: float, noise: Array) -> None:
+def add_process_noise(P: Array, dt: float, interval: float, noise: Array, sample: Array) -> None:
     """Add what white noise and random walks do in dt seconds (S eq. 261, position integrated exactly).
 
     interval is the time (s) between the two samples that dt is a part of. One longer than noise[GAP_S] is a gap:
     angular rate and acceleration may have been anything of the given size all through it, so that their sigma grows
-    with the interval and not with its root.
+    with the interval and not with its root. sample (9,) is the row of the interval's end (`fusion/imu_noise.py`).
     """
-    gyro, accel = noise[GYRO_NOISE] ** 2, noise[ACCEL_NOISE] ** 2
+    gyro = density_squared(noise[GYRO_NOISE], sample, GYRO_SQUARES, noise[MEASURED])
+    accel = density_squared(noise[ACCEL_NOISE], sample, ACCEL_SQUARES, noise[MEASURED])
     if interval > noise[GAP_S]:
         gyro += noise[GAP_RATE] ** 2 * interval
         accel += noise[GAP_ACCEL] ** 2 * interval

@@ -34,8 +34,11 @@ VOTES = 256  # a second of eight objects at 30 Hz; a power of two, so that place
     CLONED,  # 1 where the clone is that of the last odometry
     REPLACED,  # how often an object of an unknown map was put elsewhere
     ANCHOR,  # 1 + the object that anchors a world whose map is unknown, 0: none yet
+    DELAY,  # by how much later than their stamps measurements are taken in, ns
+    LEAST_DELAY,  # the least that this ever was
+    LAST_STAMP,  # of the measurements taken in last
     N_COUNTERS,
-) = range(15)
+) = range(18)
 INITIALISING, TRACKING = 0, 1
 
 TALLY_SIZE, PLACE_SIZE = 8, 15  # rows of tallies and places, see place_watch.py

@@ -241,10 +241,13 @@ class Odometry:
 
 @dataclass(frozen=True)
 class Imu:
-    """How far the IMU's noise in calibration.yaml is to be believed."""
+    """How far the IMU's noise in calibration.yaml is to be believed: data sheets know an IMU at rest."""
 
+    measured: bool = True
+    """Take the noise densities at least as large as the samples themselves show, by the mean square of their fourth
+    differences over the last seconds: aloft that may be ten and fifty times the data sheet's."""
     noise_scale: float = 1.0
-    """The noise densities are taken so many times larger. Data sheets know an IMU at rest; EuRoC's need 10."""
+    """The stated noise densities are taken so many times larger."""
     walk_scale: float = 1.0
     """The biases' random walks likewise."""
 

@@ -194,6 +194,7 @@ def fill_memory(problem: Problem, options: FuseOptions) -> tuple[Array, NDArray[
         options.gap.angular_rate,
         options.gap.acceleration,
     )
+    m.noise[imu.MEASURED] = options.imu.measured and problem.motion in WITH_IMU
     m.limits[: filter_loop.SETTLED + 1] = _limits(options)
     m.start[: consensus.MIN_SHARE + 1] = _start(options)
     bias = options.bias

@@ -100,21 +100,21 @@ class ReferenceFilter:
             middle = 0.5 * ((now - imu_stamps[k]) + (stop - imu_stamps[k]))
             share = middle / (imu_stamps[k + 1] - imu_stamps[k])
             if m.noise[odometry.IS_ODOMETRY]:
-                self._step_by_odometry((stop - now) * 1e-9, imu_values[k])
+                self._step_by_odometry((stop - now) * 1e-9, imu_values[k, :6])
             else:
                 values = imu_values[k] + share * (imu_values[k + 1] - imu_values[k])
-                self._step((stop - now) * 1e-9, (imu_stamps[k + 1] - imu_stamps[k]) * 1e-9, values)
+                self._step((stop - now) * 1e-9, (imu_stamps[k + 1] - imu_stamps[k]) * 1e-9, values, imu_values[k + 1])
             c[memory.NOW] = stop
             c[memory.IMU_AT] += stop == imu_stamps[k + 1]
 
-    def _step(self, dt: float, interval: float, values: Array) -> None:
+    def _step(self, dt: float, interval: float, values: Array, sample: Array) -> None:
         m = self.m
         if not self.tracking:  # no covariance yet; the compiled step also keeps the mean specific force
-            imu.propagate_nominal(m.x, dt, values[:3].copy(), values[3:].copy(), self.work.step)
+            imu.propagate_nominal(m.x, dt, values[:3].copy(), values[3:6].copy(), self.work.step)
             filter_loop._watch_gravity(m, self.work, dt)
             return
-        m.x[:], F = transition(m.x, dt, values[:3], values[3:], self.layout)
-        self.spread(F, process_noise(self.layout.n_error, dt, interval, m.noise))
+        m.x[:], F = transition(m.x, dt, values[:3], values[3:6], self.layout)
+        self.spread(F, process_noise(self.layout.n_error, dt, interval, m.noise, sample))
 
     def _step_by_odometry(self, dt: float, twist: Array) -> None:
         m = self.m
@@ -316,17 +316,25 @@ def run_log(
     f = ReferenceFilter(floats, integers)
     measured = (kinds, objects, rotations, translations, covariances)
     filter_loop.begin(f.m, imu_stamps[0], imu_values[0, 3:6].copy(), 0)
-    span = (stamps >= imu_stamps[0]) & (stamps <= imu_stamps[-1])
-    rows = 0
-    for stamp in np.union1d(imu_stamps, stamps[span]):
-        f.advance(imu_stamps, imu_values, stamp)
-        first, last = np.searchsorted(stamps, [stamp, stamp + 1])
-        if last > first:
-            gyro = [np.interp(stamp - imu_stamps[0], imu_stamps - imu_stamps[0], imu_values[:, i]) for i in range(3)]
-            f.measure(first, last, measured, np.array(gyro) - f.m.x[GYRO_BIAS : GYRO_BIAS + 3], decisions, nis)
-        if f.tracking:
-            out_stamps[rows], out_core[rows] = stamp, f.m.x[: filter_loop.OUT_CORE]
-            out_sigma[rows] = np.sqrt(np.diag(f.m.P)[: filter_loop.OUT_SIGMA].clip(min=0.0))
-            out_covariance[rows] = f.m.P[:6, :6].ravel()
-            rows += 1
+    j, rows = int(np.searchsorted(stamps, imu_stamps[0])), 0
+    for end in imu_stamps:
+        due = -1
+        while due <= end:
+            due = filter_loop.due(f.m, stamps[j]) if j < len(stamps) else end + 1
+            stamp = min(due, end)
+            f.advance(imu_stamps, imu_values, stamp)
+            if due <= end:
+                last = int(np.searchsorted(stamps, stamps[j] + 1))
+                f.m.limits[filter_loop.NOMINAL_OFFSET] = (stamp - stamps[j]) * 1e-9
+                since = imu_stamps - imu_stamps[0]
+                gyro = [np.interp(stamp - imu_stamps[0], since, imu_values[:, i]) for i in range(3)]
+                f.measure(j, last, measured, np.array(gyro) - f.m.x[GYRO_BIAS : GYRO_BIAS + 3], decisions, nis)
+                f.m.counters[memory.LAST_STAMP] = stamps[j]
+                filter_loop.retime(f.m)
+                j = last
+            if f.tracking and (rows == 0 or out_stamps[rows - 1] != stamp):
+                out_stamps[rows], out_core[rows] = stamp, f.m.x[: filter_loop.OUT_CORE]
+                out_sigma[rows] = np.sqrt(np.diag(f.m.P)[: filter_loop.OUT_SIGMA].clip(min=0.0))
+                out_covariance[rows] = f.m.P[:6, :6].ravel()
+                rows += 1
     return rows

@@ -119,12 +119,16 @@ def odometry_transition(x: Array, dt: float, rate: Array, velocity: Array, layou
     return moved, F
 
 
-def process_noise(n: int, dt: float, interval: float, noise: Array) -> Array:
-    """Return the dense Q (n, n) of `dt` seconds, Sola eq. 261 position integrated; a long interval is a gap."""
+def process_noise(n: int, dt: float, interval: float, noise: Array, sample: Array) -> Array:
+    """Return the dense Q (n, n) of `dt` seconds, Sola eq. 261 position integrated; a long interval is a gap.
+
+    sample (9,) is the row of the interval's end, with what the samples themselves show.
+    """
     Q, I = np.zeros((n, n)), np.eye(3)  # noqa: E741
     gap = interval > noise[imu.GAP_S]
-    gyro = noise[imu.GYRO_NOISE] ** 2 + (noise[imu.GAP_RATE] ** 2 * interval if gap else 0.0)
-    accel = noise[imu.ACCEL_NOISE] ** 2 + (noise[imu.GAP_ACCEL] ** 2 * interval if gap else 0.0)
+    shown = sample[6:8] / sample[8] if noise[imu.MEASURED] and sample[8] > 0.0 else np.zeros(2)
+    gyro = max(noise[imu.GYRO_NOISE] ** 2, shown[0]) + (noise[imu.GAP_RATE] ** 2 * interval if gap else 0.0)
+    accel = max(noise[imu.ACCEL_NOISE] ** 2, shown[1]) + (noise[imu.GAP_ACCEL] ** 2 * interval if gap else 0.0)
     Q[ATT, ATT] = gyro * dt * I
     Q[VEL, VEL] = accel * dt * I
     Q[POS, VEL] = Q[VEL, POS] = 0.5 * accel * dt**2 * I

@@ -11,8 +11,21 @@ from __future__ import annotations
 import math
 
 from fusion.compiled import njit
-from fusion.filter_loop import advance, angular_velocity_at, begin, measure
-from fusion.memory import IMU_AT, N_COUNTERS, NOW, VOTE_HEAD, VOTES, Memory, Work, views, work_views
+from fusion.filter_loop import advance, begin, due, measure_at
+from fusion.imu_noise import REACH, follow_noise
+from fusion.memory import (
+    IMU_AT,
+    LAST_STAMP,
+    LEAST_DELAY,
+    N_COUNTERS,
+    NOW,
+    VOTE_HEAD,
+    VOTES,
+    Memory,
+    Work,
+    views,
+    work_views,
+)
 from fusion.nav_state import N_ERROR, Array, Ints
 from fusion.replay_memory import (
     AHEAD,
@@ -60,10 +73,10 @@ def feed(floats: Array, integers: Ints, ring_floats: Array, ring_integers: Ints,
         if stamp > newest + h[AHEAD]:
             h[TOO_EARLY] += n
             return
-        in_the_past = h[BEGUN] == 1 and stamp <= m.counters[NOW]
+        in_the_past = h[BEGUN] == 1 and not _before(m.counters, stamp)
         changed = _put_poses(r, stamp, n, in_the_past)
     if changed and in_the_past:
-        _rewind(m, r, floats, stamp)
+        _rewind(m, r, floats, stamp, what)
     if changed:
         _run(m, w, r, floats)
 
@@ -83,24 +96,23 @@ def _put_sample(r: Ring, m: Memory, stamp: int, in_the_past: bool) -> bool:
     if at < h[IMU_COUNT] and r.imu_stamps[at] == stamp:
         h[DUPLICATES] += 1
         return False
-    if in_the_past and not _reachable(r, stamp):
+    if in_the_past and not _reachable(r, stamp, IMU_SAMPLE):
         h[TOO_LATE] += 1
         return False
     for i in range(h[IMU_COUNT], at, -1):
         r.imu_stamps[i] = r.imu_stamps[i - 1]
-        for j in range(6):
-            r.imu_values[i, j] = r.imu_values[i - 1, j]
+        r.imu_values[i] = r.imu_values[i - 1]
     r.imu_stamps[at] = stamp
-    for j in range(6):
-        r.imu_values[at, j] = r.sample[j]
+    r.imu_values[at, :6] = r.sample
     h[IMU_COUNT] += 1
+    follow_noise(r.imu_stamps, r.imu_values, at, h[IMU_COUNT])
     return True
 
 
 @njit(cache=True)
 def _put_poses(r: Ring, stamp: int, n: int, in_the_past: bool) -> bool:
     h = r.header
-    if in_the_past and not _reachable(r, stamp):
+    if in_the_past and not _reachable(r, stamp, POSES):
         h[TOO_LATE] += n
         return False
     changed = False
@@ -175,13 +187,24 @@ def _same(r: Ring, at: int, i: int) -> bool:
 
 
 @njit(cache=True)
-def _reachable(r: Ring, stamp: int) -> bool:
+def _before(counters: Ints, stamp: int) -> bool:
+    """Tell whether a filter with these counters has yet to take in poses of a stamp, whenever they were due."""
+    return counters[LAST_STAMP] < stamp and counters[NOW] < stamp + counters[LEAST_DELAY]
+
+
+@njit(cache=True)
+def _is_before(counters: Ints, stamp: int, what: int) -> bool:
+    return counters[NOW] < stamp if what == IMU_SAMPLE else _before(counters, stamp)
+
+
+@njit(cache=True)
+def _reachable(r: Ring, stamp: int, what: int) -> bool:
     """Tell whether there is a state from before this stamp to go back to."""
     h = r.header
     if h[DROPPED] == 0:
         return True
-    oldest = r.snapshot_counters[h[FIRST_SNAPSHOT] % h[SNAPSHOTS], NOW]
-    return h[FIRST_SNAPSHOT] < h[END_SNAPSHOT] and oldest < stamp
+    oldest = r.snapshot_counters[h[FIRST_SNAPSHOT] % h[SNAPSHOTS]]
+    return h[FIRST_SNAPSHOT] < h[END_SNAPSHOT] and _is_before(oldest, stamp, what)
 
 
 @njit(cache=True)
@@ -193,10 +216,10 @@ def _forget_samples(r: Ring, m: Memory) -> None:
         if 2 * oldest >= h[IMU_CAPACITY] or h[END_SNAPSHOT] - h[FIRST_SNAPSHOT] <= 1:
             break
         h[FIRST_SNAPSHOT] += 1
+    oldest = max(0, oldest - REACH)
     for i in range(oldest, h[IMU_COUNT]):
         r.imu_stamps[i - oldest] = r.imu_stamps[i]
-        for j in range(6):
-            r.imu_values[i - oldest, j] = r.imu_values[i, j]
+        r.imu_values[i - oldest] = r.imu_values[i]
     h[IMU_COUNT] -= oldest
     h[DROPPED] = 1
     m.counters[IMU_AT] -= oldest
@@ -210,7 +233,7 @@ def _forget_poses(r: Ring) -> None:
     h = r.header
     if h[FIRST_SNAPSHOT] == h[END_SNAPSHOT]:
         return
-    oldest, gone = r.snapshot_counters[h[FIRST_SNAPSHOT] % h[SNAPSHOTS], NOW], 0
+    oldest, gone = r.snapshot_counters[h[FIRST_SNAPSHOT] % h[SNAPSHOTS], LAST_STAMP], 0
     while gone < h[NEXT] and r.stamps[gone] <= oldest:
         gone += 1
     for i in range(gone, h[COUNT]):
@@ -237,12 +260,12 @@ def _take_snapshot(m: Memory, r: Ring, floats: Array) -> None:
 
 
 @njit(cache=True)
-def _rewind(m: Memory, r: Ring, floats: Array, stamp: int) -> None:
+def _rewind(m: Memory, r: Ring, floats: Array, stamp: int, what: int) -> None:
     """Restore the newest snapshot before a stamp, or what was before the beginning."""
     h, head = r.header, m.counters[VOTE_HEAD]
     h[REPLAYS] += 1
     while h[END_SNAPSHOT] > h[FIRST_SNAPSHOT]:
-        if r.snapshot_counters[(h[END_SNAPSHOT] - 1) % h[SNAPSHOTS], NOW] < stamp:
+        if _is_before(r.snapshot_counters[(h[END_SNAPSHOT] - 1) % h[SNAPSHOTS]], stamp, what):
             break
         h[END_SNAPSHOT] -= 1
     if h[END_SNAPSHOT] == h[FIRST_SNAPSHOT]:
@@ -259,7 +282,7 @@ def _rewind(m: Memory, r: Ring, floats: Array, stamp: int) -> None:
     for i in range(VOTES):  # a restart marks old votes as used, so marks are kept beside the votes
         m.used[i] = r.snapshot_used[s, i]
     h[NEXT] = h[COUNT]
-    while h[NEXT] > 0 and r.stamps[h[NEXT] - 1] > m.counters[NOW]:
+    while h[NEXT] > 0 and r.stamps[h[NEXT] - 1] > m.counters[LAST_STAMP]:
         h[NEXT] -= 1
 
 
@@ -289,7 +312,7 @@ def _run(m: Memory, w: Work, r: Ring, floats: Array) -> None:
 def _measure_until(m: Memory, w: Work, r: Ring, until: int) -> None:
     """Take in the waiting measurements up to a stamp that the IMU has reached."""
     h = r.header
-    while h[NEXT] < h[COUNT] and r.stamps[h[NEXT]] <= until:
+    while h[NEXT] < h[COUNT] and due(m, r.stamps[h[NEXT]]) <= until:
         first, last, stamp = h[NEXT], h[NEXT], r.stamps[h[NEXT]]
         while last < h[COUNT] and r.stamps[last] == stamp:
             vote = m.counters[VOTE_HEAD] + last - first
@@ -297,8 +320,6 @@ def _measure_until(m: Memory, w: Work, r: Ring, until: int) -> None:
             r.overwritten[place] = m.votes[slot]
             r.overwritten_stamps[place] = m.vote_stamps[slot]
             last += 1
-        advance(m, w, r.imu_stamps, r.imu_values, stamp)
-        angular_velocity_at(m, r.imu_stamps, r.imu_values, r.rate)
-        columns = (r.kinds, r.objects, r.rotations, r.translations, r.covariances)
-        measure(m, w, first, last, *columns, r.rate, r.decisions, r.nis)
+        columns = (r.stamps, r.kinds, r.objects, r.rotations, r.translations, r.covariances)
+        measure_at(m, w, first, last, *columns, r.imu_stamps, r.imu_values, r.rate, r.decisions, r.nis)
         h[NEXT] = last

@@ -8,6 +8,7 @@ import numpy as np
 
 from fusion.compiled import njit
 from fusion.consensus import VOTE_SIZE
+from fusion.imu_noise import SAMPLE_SIZE
 from fusion.memory import END_OF_STATE, N_COUNTERS, VOTES
 from fusion.nav_state import Array, Ints
 
@@ -44,7 +45,7 @@ class Ring(NamedTuple):
 
     header: Ints
     imu_stamps: Ints
-    imu_values: Array  # (., 6) angular velocity, specific force
+    imu_values: Array  # (., 9) rows of `imu_noise.imu_rows`
     stamps: Ints  # measurements, sorted by stamp and object
     kinds: Ints
     objects: Ints
@@ -73,7 +74,7 @@ def allocate_ring(
 ) -> tuple[Array, Ints]:
     """Return the zeroed arrays beside a filled filter memory, whose state is kept as the one to begin from."""
     state_size, snapshots = int(integers[END_OF_STATE]), horizon_ns // interval_ns + 3
-    float_size = 6 * imu_capacity + 51 * capacity + snapshots * (state_size + VOTES) + state_size
+    float_size = SAMPLE_SIZE * imu_capacity + 51 * capacity + snapshots * (state_size + VOTES) + state_size
     float_size += VOTE_SIZE * capacity + 9 + 48 * BATCH
     integer_size = RING_HEADER + imu_capacity + 5 * capacity + snapshots * N_COUNTERS + 2 * BATCH
     ring_floats, ring_integers = np.zeros(float_size), np.zeros(integer_size, dtype=np.int64)
@@ -87,7 +88,7 @@ def allocate_ring(
 def ring_views(f: Array, i: Ints) -> Ring:
     """Return the parts of the two arrays by name."""
     ci, cm, s, size = i[IMU_CAPACITY], i[CAPACITY], i[SNAPSHOTS], i[STATE_SIZE]
-    a = 6 * ci
+    a = SAMPLE_SIZE * ci
     b = a + 9 * cm
     c = b + 3 * cm
     d = c + 36 * cm
@@ -105,7 +106,7 @@ def ring_views(f: Array, i: Ints) -> Ring:
     return Ring(
         i[0:RING_HEADER],
         i[RING_HEADER:j],
-        f[0:a].reshape((ci, 6)),
+        f[0:a].reshape((ci, SAMPLE_SIZE)),
         i[j : j + cm],
         i[j + cm : j + 2 * cm],
         i[j + 2 * cm : j + 3 * cm],

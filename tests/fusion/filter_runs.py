@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from fusion import memory
+from fusion.imu_noise import imu_rows
 from fusion.nav_state import StateLayout
 from fusion.options import FuseOptions
 from fusion.prepare import Problem, fill_memory, pose_problem
@@ -62,8 +63,7 @@ def run(loop: Callable[..., int], problem: Problem, options: FuseOptions) -> Fil
     out = [np.zeros(count, np.int64), np.full((count, 3), np.nan), np.zeros(rows, np.int64)]
     out += [np.zeros((rows, 21)), np.zeros((rows, 15)), np.zeros((rows, 36))]
     columns = (measured.kinds, measured.objects, measured.rotations, measured.translations, measured.covariances)
-    values = np.hstack([imu.angular_velocity, imu.specific_force])
-    written = loop(floats, integers, imu.stamps_ns, values, measured.stamps_ns, *columns, *out)
+    written = loop(floats, integers, imu.stamps_ns, imu_rows(imu), measured.stamps_ns, *columns, *out)
     return FilterRun(*out[:2], *(column[:written] for column in out[2:]), memory.views.py_func(floats, integers))
 
 

@@ -17,6 +17,7 @@ from fusion.graph import run_graph
 from fusion.graph_rows import Between
 from fusion.graph_smoother import joint_covariance
 from fusion.graph_variables import imu_bias_key, pose_key, velocity_key
+from fusion.imu_noise import imu_rows
 from fusion.memory import views
 from fusion.nav_state import StateLayout, local_state, nominal_state, retract_state
 from fusion.options import DetectionBias, FuseOptions, Gate, Graph
@@ -109,7 +110,7 @@ def test_rows_between_keyframes_are_those_of_the_gaussian_given_both_ends():
     """Condition the joint Gaussian of start, moment and end, built from transitions, on the ends by dense algebra."""
     options, problem, rng = FuseOptions(), simulated(), np.random.default_rng(0)
     stamps = problem.imu.stamps_ns
-    values = np.hstack([problem.imu.angular_velocity, problem.imu.specific_force])
+    values = imu_rows(problem.imu)
     noise = views.py_func(*fill_memory(problem, options)).noise
     between = Between(stamps, values, noise, 15)
     x, layout = nominal_state(StateLayout()), StateLayout()

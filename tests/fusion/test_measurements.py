@@ -176,7 +176,7 @@ def transition(x, layout, dt, rate, force, noise):
     def propagate(P):
         P = P.copy()
         core, scratch = np.zeros((17, 15)), np.zeros((3, n))
-        imu.propagate_covariance(P, blocks, dt, dt, noise, basis, layout.as_integers(), core, scratch)
+        imu.propagate_covariance(P, blocks, dt, dt, noise, np.zeros(9), basis, layout.as_integers(), core, scratch)
         return P
 
     return moved, propagate

@@ -108,6 +108,18 @@ def test_shuffled_input_gives_the_in_order_result(layout, seed):
     assert health.replays > 50
 
 
+@pytest.mark.parametrize("delay_s", [-0.03, 0.03])
+def test_shuffled_input_gives_the_in_order_result_while_the_time_offset_is_followed(delay_s):
+    problem = simulated(layout=LAYOUTS["time offset"], noise="white", stamp_delay_s=delay_s)
+    options = FuseOptions()
+    estimator = estimator_for(problem, options, OnlineOptions(horizon_s=0.4))
+    for event in shuffled(problem, 0.3, np.random.default_rng(3)):
+        feed(estimator, problem, event)
+    assert_ends_like(estimator, problem, options)
+    assert abs(estimator.memory.counters[memory.DELAY]) > 15_000_000
+    assert estimator.health().too_late == 0
+
+
 def test_poses_that_are_always_late_give_the_in_order_result():
     problem, options = simulated("camera"), FuseOptions(measurements="camera")
     delayed = sorted(events(problem), key=lambda event: event[0] + (50_000_000 if event[1] == 0 else 0))

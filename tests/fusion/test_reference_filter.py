@@ -43,6 +43,13 @@ def test_compiled_is_plain_through_an_imu_gap_and_with_noise_that_adapts():
     assert np.any(compiled.memory.scales > 1.0)
 
 
+def test_compiled_is_plain_while_the_time_offset_is_followed():
+    problem, options = simulated(layout=LAYOUTS["time offset"], noise="white", stamp_delay_s=0.02), FuseOptions()
+    compiled, plain = (run(loop, problem, options) for loop in (filter_loop.run_log, reference_filter.run_log))
+    assert_same(compiled, plain)
+    assert compiled.memory.counters[memory.DELAY] == pytest.approx(-20e6, abs=5e6)
+
+
 def test_compiled_is_plain_on_an_unknown_map():
     options = FuseOptions(estimate=Estimate(map="unknown", extrinsics=True), noise=DetectionNoise(rotation_deg=2.0))
     problem = simulated(noise="white", options=options, covariances=False, symmetric_objects=0)

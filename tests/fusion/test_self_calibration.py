@@ -9,6 +9,7 @@ import pytest
 from scipy.spatial.transform import RigidTransform
 
 from fusion.fuse import fuse
+from fusion.imu_noise import imu_rows
 from fusion.memory import views
 from fusion.nav_state import EXTRINSIC_ROTATION, OBJECT_SIZE, OBJECTS, TIME_OFFSET, pose_at
 from fusion.options import DetectionBias, Estimate, FuseOptions
@@ -17,7 +18,7 @@ from fusion.result import FuseResult
 from fusion.simulate import SimulationOptions, simulate
 from poet_loc.core.consistency import pose_nees
 from poet_loc.core.geometry import local
-from poet_loc.io.log_folder import Log
+from poet_loc.io.log_folder import Log, read_log
 
 WHITE = FuseOptions(bias=DetectionBias(use=False))
 
@@ -42,11 +43,10 @@ def final_state(log: Log, options: FuseOptions) -> np.ndarray:
     buffers = fill_memory(problem, options)
     m, samples = problem.measurements, problem.imu
     rows = len(m) + len(samples)
-    values = np.hstack([samples.angular_velocity, samples.specific_force])
     columns = (m.kinds, m.objects, m.rotations, m.translations, m.covariances)
     outputs = (np.zeros(rows, np.int64), np.zeros((rows, 21)), np.zeros((rows, 15)), np.zeros((rows, 36)))
     decisions, nis = np.zeros(len(m), np.int64), np.zeros((len(m), 3))
-    filter_loop.run_log(*buffers, samples.stamps_ns, values, m.stamps_ns, *columns, decisions, nis, *outputs)
+    filter_loop.run_log(*buffers, samples.stamps_ns, imu_rows(samples), m.stamps_ns, *columns, decisions, nis, *outputs)
     return views.py_func(*buffers).x
 
 
@@ -55,6 +55,15 @@ def test_a_wrong_time_offset_is_found(log):
     x = final_state(late, replace(WHITE, estimate=Estimate(time_offset=True)))
     true_offset = log.calibration.timeshift_cam_imu_s
     assert x[TIME_OFFSET] + 0.05 == pytest.approx(true_offset, abs=0.003)
+
+
+@pytest.mark.parametrize("wrong_s", [0.05, -0.05])
+def test_a_wrong_time_offset_is_found_with_a_real_imu(shared_data, wrong_s):
+    log = read_log(shared_data / "euroc_v101")
+    late = replace(log, calibration=replace(log.calibration, timeshift_cam_imu_s=wrong_s))
+    found = fuse(late, FuseOptions(estimate=Estimate(time_offset=True))).calibrated
+    assert found.timeshift_cam_imu_s == pytest.approx(log.calibration.timeshift_cam_imu_s, abs=0.003)
+    assert found.timeshift_sigma_s < 0.003
 
 
 def test_wrong_extrinsics_are_found(log):

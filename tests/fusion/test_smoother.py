@@ -13,6 +13,7 @@ from scipy.sparse.linalg import splu
 from fusion import filter_loop, memory, reference_filter, smoother
 from fusion.detection_errors import NetworkErrors, WhiteErrors
 from fusion.fuse import fuse, run_filter
+from fusion.imu_noise import imu_rows
 from fusion.nav_state import CORE, EXTRINSIC_ROTATION, GYRO_BIAS, StateLayout, local_state, retract_state
 from fusion.options import DetectionBias, DetectionNoise, Estimate, FuseOptions, Gate
 from fusion.prepare import pose_problem
@@ -35,7 +36,7 @@ class FixedPoint(reference_filter.ReferenceFilter):
 
     def keep(self) -> None:
         self.x, self.P, self.C = self.m.x.copy(), self.m.P.copy(), self.m.P.copy()
-        self.error = np.zeros(self.layout.n_error)
+        self.error, self.stamp = np.zeros(self.layout.n_error), self.m.counters[memory.NOW]
 
     def spread(self, A, Q):
         super().spread(A, Q)
@@ -93,7 +94,7 @@ def assert_smoothed_like_fixed_point(monkeypatch, problem, options, share):
     np.testing.assert_array_equal(plain.decisions, compiled.decisions)
 
     core, covariance = smooth(problem, *memory_of(problem, options))[1:]
-    row = int(np.searchsorted(compiled.stamps, anchor))
+    row = int(np.searchsorted(compiled.stamps, kept.stamp))
     np.testing.assert_allclose(kept.x[:EXTRINSIC_ROTATION], compiled.core[row], atol=1e-9)
     core_layout, error = StateLayout(), kept.error[:CORE]
     before = kept.x[: core_layout.n_nominal]
@@ -163,7 +164,8 @@ class BatchLeastSquares:
         columns = (measured.kinds, measured.objects, measured.rotations, measured.translations, measured.covariances)
         self.stamps = np.unique(np.r_[start_ns, later, measured.stamps_ns[inside]])
         self.poses = [c[inside] for c in (np.searchsorted(self.stamps, measured.stamps_ns), *columns)]
-        values = np.hstack([imu.angular_velocity, imu.specific_force])
+        rows = imu_rows(imu)
+        values, self.samples = rows[:, :6], rows[np.searchsorted(imu.stamps_ns, self.stamps[1:])]
         samples, at = (imu.stamps_ns - start_ns) * 1e-9, (self.stamps - start_ns) * 1e-9
         self.steps = np.diff(at)
         self.values = np.stack([np.interp(0.5 * (at[1:] + at[:-1]), samples, c) for c in values.T], axis=1)
@@ -177,10 +179,10 @@ class BatchLeastSquares:
         """Yield (covariance, residual, {state number: Jacobian}) with residual(x (+) d) = residual - sum of J d."""
         n, x = self.layout.n_error, self.states
         yield self.prior_P, local_state(x[0], self.prior_x, self.layout), {0: np.eye(n)}
-        for i, (dt, value) in enumerate(zip(self.steps, self.values)):
+        for i, (dt, value, sample) in enumerate(zip(self.steps, self.values, self.samples)):
             moved, F = transition(x[i], dt, value[:3], value[3:], self.layout)
             step = local_state(x[i + 1], moved, self.layout)
-            yield process_noise(n, dt, dt, self.noise), step, {i: -F, i + 1: np.eye(n)}
+            yield process_noise(n, dt, dt, self.noise, sample), step, {i: -F, i + 1: np.eye(n)}
         for i, kind, k, R_m, t_m, R in zip(*self.poses):
             rate = self.rates[i] - x[i][GYRO_BIAS : GYRO_BIAS + 3]
             r, H = residual_and_jacobian(int(kind), int(k), R_m.reshape(3, 3), t_m, x[i], rate, 0.0, self.layout)
