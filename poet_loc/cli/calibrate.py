@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from poet_loc.cli.arguments import Flat
+from poet_loc.io.whole_folder import not_there
 from poet_loc.train.variances import CalibrateOptions
 
 
@@ -22,6 +23,8 @@ def execute(arguments: Arguments) -> None:
     """Calibrate and say by how much."""
     from poet_loc.train.variances import calibrate
 
+    if arguments.figure is not None:
+        not_there(arguments.figure, arguments.options.overwrite)
     found = calibrate(arguments.options)
     before, after = found.gap(found.before), found.gap(found.after)
     print(f"{arguments.options.target}: {found.objects} objects")

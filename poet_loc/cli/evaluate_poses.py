@@ -11,6 +11,7 @@ import tyro
 
 from poet_loc.cli.arguments import Flat
 from poet_loc.cli.terminal import print_tables
+from poet_loc.io.whole_folder import whole_folder
 from poet_loc.report.pose_evaluation import EvaluatePosesOptions, evaluate_poses
 from poet_loc.report.pose_tables import pose_tables
 
@@ -26,6 +27,8 @@ class Arguments:
     options: Flat[EvaluatePosesOptions]
     out: Path | None = None
     """Folder for poses.json, poses.md and poses.tex."""
+    overwrite: bool = False
+    """Replace what is there."""
 
 
 def execute(arguments: Arguments) -> None:
@@ -34,7 +37,7 @@ def execute(arguments: Arguments) -> None:
     tables = pose_tables(found)
     print_tables(tables)
     if arguments.out is not None:
-        arguments.out.mkdir(parents=True, exist_ok=True)
-        (arguments.out / "poses.json").write_text(json.dumps([e.to_json() for e in found], indent=1) + "\n")
-        (arguments.out / "poses.md").write_text("\n".join(table.markdown() for table in tables))
-        (arguments.out / "poses.tex").write_text("\n".join(table.latex() for table in tables))
+        with whole_folder(arguments.out, arguments.overwrite, arguments.results) as folder:
+            (folder / "poses.json").write_text(json.dumps([e.to_json() for e in found], indent=1) + "\n")
+            (folder / "poses.md").write_text("\n".join(table.markdown() for table in tables))
+            (folder / "poses.tex").write_text("\n".join(table.latex() for table in tables))

@@ -19,11 +19,13 @@ class Arguments:
     """File to write; detect runs it with --exported."""
     image_size: tuple[int, int] | None = None
     """(width, height) px of the images; without it that of the training images.  The graph works for no other size."""
+    overwrite: bool = False
+    """Replace the file."""
 
 
 def execute(arguments: Arguments) -> None:
     """Export and say where to."""
     from poet_loc.model.export import ExportOptions, export
 
-    path = export(ExportOptions(arguments.weights, arguments.target, arguments.image_size))
+    path = export(ExportOptions(arguments.weights, arguments.target, arguments.image_size, arguments.overwrite))
     print(f"{path}: poses agree with the network's")

@@ -23,3 +23,11 @@ class InputError(Exception):
         where = "" if path is None else f"{path}: " if line is None else f"{path}:{line}: "
         remedy = "" if fix is None else f"; {fix}"
         super().__init__(" ".join(f"{where}{what}{remedy}".split()))
+
+
+def at_least(least: float, options: object, *names: str) -> None:
+    """Raise InputError for a field of an options record that is no number, or below the least that makes sense."""
+    for name in names:
+        value = getattr(options, name)
+        if not isinstance(value, int | float) or not value >= least:
+            raise InputError(f"{name.replace('_', '-')} is {value!r}", fix=f"give at least {least:g}")

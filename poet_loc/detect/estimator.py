@@ -22,6 +22,7 @@ from poet_loc.detect.options import DetectOptions
 from poet_loc.io.boxes_csv import read_boxes
 from poet_loc.model.backbone import Features, ImageBatch, batch_images
 from poet_loc.model.checkpoint import ModelConfig, load_model
+from poet_loc.model.device import device_of
 from poet_loc.model.fast_poses import FastPoses
 from poet_loc.model.heads import covariance_matrices, rotation_matrices
 from poet_loc.model.poet import PoET, PoseOutput
@@ -90,7 +91,7 @@ class Estimator:
         if options.threads is not None:
             torch.set_num_threads(options.threads)
         self.network, self.config = _load(options)
-        self.device = torch.device(options.device)
+        self.device = device_of(options.device)
         self.network.to(self.device).requires_grad_(False)
         self.engine = self._engine()
         self.intrinsics = options.intrinsics or intrinsics or self.config.intrinsics

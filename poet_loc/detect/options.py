@@ -6,6 +6,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
+from poet_loc.core.input_error import at_least
+
 Engine = Literal["fast", "bfloat16", "eager"]
 
 
@@ -48,3 +50,7 @@ class DetectOptions:
     """Draw boxes and axes into copies of the images."""
     axis_m: float = 0.05
     """Length of the drawn axes."""
+
+    def __post_init__(self) -> None:
+        at_least(1, self, "batch", *([] if self.threads is None else ["threads"]))
+        at_least(1e-6, self, "rate")

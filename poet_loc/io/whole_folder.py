@@ -32,6 +32,14 @@ def write_whole_file(path: str | Path, parts: Iterable[str]) -> None:
         raise
 
 
+def not_there(target: str | Path, overwrite: bool = False) -> None:
+    """Raise InputError for a file that is there and must not be overwritten, or that is a folder."""
+    if Path(target).is_dir():
+        raise InputError("is a folder", path=target, fix="name a file")
+    if Path(target).exists() and not overwrite:
+        raise InputError("is there already", path=target, fix="choose another name or pass --overwrite")
+
+
 @contextmanager
 def whole_folder(target: str | Path, overwrite: bool = False, inputs: Iterable[str | Path] = ()) -> Iterator[Path]:
     """Yield a temporary sibling folder that takes the target's place when the block ends well.

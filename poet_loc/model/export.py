@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import logging
+import tempfile
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -15,6 +16,7 @@ import torch
 from torch import Tensor, nn
 
 from poet_loc.core.input_error import InputError
+from poet_loc.io.whole_folder import not_there
 from poet_loc.model.checkpoint import ModelConfig, load_model
 from poet_loc.model.poet import PoET, QueryContext
 from poet_loc.model.queries import QueryBoxes
@@ -32,6 +34,8 @@ class ExportOptions:
     """File to write: .onnx, or .xml for OpenVINO."""
     image_size: tuple[int, int] | None = None
     """(width, height) px of the images; without it that of the training images.  The graph works for no other size."""
+    overwrite: bool = False
+    """Replace the file."""
 
 
 class PoseGraph(nn.Module):
@@ -66,23 +70,28 @@ def export(options: ExportOptions) -> Path:
 
     Raises InputError for unknown suffixes, missing runtimes, and a graph whose poses differ by more than 1e-4.
     """
+    target = options.target
+    if target.suffix not in SUFFIXES:
+        raise InputError(f"{target.suffix or 'no suffix'} is neither .onnx nor .xml", path=target)
+    not_there(target, options.overwrite)
     network, config = load_model(options.weights)
-    if options.target.suffix not in SUFFIXES:
-        raise InputError(f"{options.target.suffix} is neither .onnx nor .xml", path=options.target)
     size = image_size_of(options, config)
     graph = PoseGraph(network, size)
-    options.target.parent.mkdir(parents=True, exist_ok=True)
-    onnx_file = options.target if options.target.suffix == ".onnx" else options.target.with_suffix(".part.onnx")
-    write_onnx(graph, onnx_file)
-    if options.target.suffix == ".xml":
-        _write_openvino(onnx_file, options.target)
-        onnx_file.unlink()
-    about = {"image_size": [size[1], size[0]], "config": config.to_json()}
-    options.target.with_suffix(options.target.suffix + ".json").write_text(json.dumps(about, indent=1) + "\n")
-    difference = largest_difference(options.target, graph)
-    if difference > 1e-4:
-        raise InputError(f"the graph's poses differ by {difference:.1e} from the network's", path=options.target)
-    return options.target
+    target.parent.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryDirectory(prefix=f".{target.name}.", dir=target.parent) as folder:
+        draft = Path(folder) / target.name
+        write_onnx(graph, draft.with_suffix(".onnx"))
+        if target.suffix == ".xml":
+            _write_openvino(draft.with_suffix(".onnx"), draft)
+            draft.with_suffix(".onnx").unlink()
+        about = {"image_size": [size[1], size[0]], "config": config.to_json()}
+        draft.with_suffix(target.suffix + ".json").write_text(json.dumps(about, indent=1) + "\n")
+        difference = largest_difference(draft, graph)
+        if not difference <= 1e-4:
+            raise InputError(f"the graph's poses differ by {difference:.1e} from the network's", path=target)
+        for file in Path(folder).iterdir():
+            file.replace(target.parent / file.name)
+    return target
 
 
 def image_size_of(options: ExportOptions, config: ModelConfig) -> tuple[int, int]:

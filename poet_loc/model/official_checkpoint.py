@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import pickle
 import re
+import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -14,6 +15,7 @@ import torch
 from torch import Tensor
 
 from poet_loc.core.input_error import InputError
+from poet_loc.io.whole_folder import not_there
 from poet_loc.model.checkpoint import ModelConfig, load_strictly, save_weights
 from poet_loc.model.options import NetworkOptions
 from poet_loc.model.poet import PoET
@@ -37,6 +39,8 @@ class ConvertCheckpoint:
     """Attention heads, if the file does not say."""
     queries: int | None = None
     """Object queries, if the file does not say."""
+    overwrite: bool = False
+    """Replace the target."""
 
 
 def read_official(path: str | Path) -> tuple[dict[str, Tensor], dict[str, Any], int | None]:
@@ -45,25 +49,34 @@ def read_official(path: str | Path) -> tuple[dict[str, Tensor], dict[str, Any], 
     Nothing in the file is executed: anything beside tensors, plain values and `ALLOWED` is refused with InputError.
     """
     try:
-        with torch.serialization.safe_globals(ALLOWED):
+        with torch.serialization.safe_globals(ALLOWED), warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # on pickles that torch did not write: what matters is said below
             content = torch.load(path, map_location="cpu", weights_only=True)
     except FileNotFoundError:
         raise InputError("no such file", path=path) from None
     except pickle.UnpicklingError as error:
         raise InputError(_refusal(str(error)), path=path) from None
     except (RuntimeError, EOFError, OSError, ValueError, KeyError, AttributeError, IndexError, TypeError) as error:
-        raise InputError(
-            f"not a whole checkpoint ({str(error).splitlines()[0] if str(error) else 'it ends early'})", path=path
-        ) from None
+        raise InputError(f"not a whole checkpoint ({_reason(error)})", path=path) from None
     if not isinstance(content, Mapping):
         raise InputError(f"holds a {type(content).__name__}, not a checkpoint", path=path)
     weights = content.get("model", content)
     if not isinstance(weights, Mapping) or not all(isinstance(w, Tensor) for w in weights.values()) or not weights:
         raise InputError("holds no state dict of tensors", path=path)
-    arguments = content.get("args", {}) if "model" in content else {}
-    arguments = vars(arguments) if isinstance(arguments, argparse.Namespace) else dict(arguments or {})
+    arguments = content.get("args") or {} if "model" in content else {}
+    arguments = vars(arguments) if isinstance(arguments, argparse.Namespace) else arguments
+    if not isinstance(arguments, Mapping):
+        raise InputError(f"its args are a {type(arguments).__name__}, not a Namespace", path=path)
     epoch = content.get("epoch") if "model" in content else None
-    return current_names(dict(weights)), arguments, epoch
+    return current_names(dict(weights)), dict(arguments), epoch
+
+
+def _reason(error: Exception) -> str:
+    if isinstance(error, EOFError) or not str(error):
+        return "it ends early"
+    if isinstance(error, RuntimeError | OSError):
+        return str(error).splitlines()[0].partition(". ")[0]
+    return "it is another kind of file"
 
 
 def _refusal(message: str) -> str:
@@ -84,7 +97,7 @@ def options_of_weights(
     except (KeyError, ValueError, ZeroDivisionError) as error:
         raise InputError(f"no weights of a PoET network (at {error})", path=path) from None
     for name, official in (("heads", "nheads"), ("queries", "num_queries")):
-        if official in arguments:
+        if arguments.get(official) is not None:
             inferred.setdefault(name, arguments[official])
         elif name not in inferred:
             raise InputError(f"does not say the number of {name}", path=path, fix=f"give --{name}")
@@ -192,11 +205,17 @@ def convert_checkpoint(options: ConvertCheckpoint) -> ModelConfig:
 
     The weights are held against the network that the configuration describes before anything is written.
     """
+    not_there(options.target, options.overwrite)
     weights, arguments, epoch = read_official(options.source)
     given = {"nheads": options.heads, "num_queries": options.queries}
     known = {**arguments, **{name: value for name, value in given.items() if value is not None}}
-    network_options = options_of_weights(weights, known, options.source)
-    detector = detector_of_weights(weights, known)
+    try:
+        network_options = options_of_weights(weights, known, options.source)
+        detector = detector_of_weights(weights, known)
+    except (ValueError, TypeError, KeyError) as error:
+        raise InputError(f"its args do not describe a network ({error})", path=options.source) from None
+    except InputError as error:
+        raise InputError(error.what, path=options.source, fix=error.fix) from None
     own = {name: w for name, w in weights.items() if not name.startswith("backbone.0.")}
     load_strictly(PoET(network_options), own, options.source)
     if isinstance(detector, YoloOptions):

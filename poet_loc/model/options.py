@@ -7,9 +7,9 @@ The variants that the faithful network does not have are the last group of field
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Literal
+from typing import Literal, get_args, get_origin, get_type_hints
 
-from poet_loc.core.input_error import InputError
+from poet_loc.core.input_error import InputError, at_least
 
 Rotation = Literal["6d", "quat", "silho_quat"]
 Uncertainty = Literal["none", "aleatoric", "full"]
@@ -68,6 +68,12 @@ class NetworkOptions:
     """allocentric: rotation seen along the ray to the object; needs intrinsics."""
 
     def __post_init__(self) -> None:
+        at_least(0, self, "encoder_layers", "dropout")
+        sizes = ("heads", "decoder_layers", "feedforward_dim", "levels", "encoder_points", "decoder_points")
+        at_least(1, self, "hidden_dim", "queries", "class_count", *sizes)
+        for name, kind in get_type_hints(type(self)).items():
+            if get_origin(kind) is Literal and getattr(self, name) not in get_args(kind):
+                raise InputError(f"{name} is {getattr(self, name)!r}", fix=f"one of {', '.join(get_args(kind))}")
         if self.hidden_dim % 32 or self.hidden_dim % self.heads:
             raise InputError(f"hidden_dim {self.hidden_dim} must be a multiple of 32 and of heads ({self.heads})")
         if self.uncertainty != "none" and self.rotation != "6d":

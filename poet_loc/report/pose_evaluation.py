@@ -132,8 +132,9 @@ class PoseEvaluation:
     """Means over the classes (those without an estimate count as 0, as published), and pooled errors."""
 
     def to_json(self) -> dict[str, object]:
-        """Return all numbers."""
-        return {"name": self.name, "classes": [asdict(c) for c in self.classes], "overall": self.overall}
+        """Return all numbers, None where there is none."""
+        classes = [{key: _or_none(value) for key, value in asdict(c).items()} for c in self.classes]
+        return {"name": self.name, "classes": classes, "overall": self.overall}
 
 
 @dataclass(frozen=True)
@@ -385,6 +386,10 @@ def overall_errors(
     for name in ("true", "matched", "missed", "false"):
         overall[name] = float(sum(getattr(c, name) for c in classes))
     return overall
+
+
+def _or_none(value: object) -> object:
+    return None if isinstance(value, float) and np.isnan(value) else value
 
 
 def _places(scenes: NDArray[np.int64], images: NDArray[np.int64], objects: NDArray[np.int64]) -> Places:

@@ -6,6 +6,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Literal
 
+from poet_loc.core.input_error import at_least
 from poet_loc.data.augmentation import AugmentationOptions
 from poet_loc.model.losses import LossOptions
 from poet_loc.model.matcher import BoxMode
@@ -52,6 +53,10 @@ class RecipeOptions:
     mixed_precision: bool = True
     """bfloat16 where there is a GPU."""
 
+    def __post_init__(self) -> None:
+        at_least(0, self, "epochs", "learning_rate", "attention_rate", "weight_decay", "clip")
+        at_least(1, self, "batch", "drop_epochs")
+
 
 @dataclass(frozen=True)
 class TrainOptions:
@@ -90,6 +95,10 @@ class TrainOptions:
     device: str = "auto"
     """cpu, cuda, or auto: cuda where there is one."""
     seed: int = 42
+
+    def __post_init__(self) -> None:
+        at_least(1, self, "save_every", "validate_every", *([] if self.max_steps is None else ["max_steps"]))
+        at_least(0, self.data, "workers")
 
 
 RECIPES: dict[str, tuple[RecipeOptions, LossOptions]] = {

@@ -18,6 +18,7 @@ from poet_loc.data.batches import EpochBatches, Samples, TrainingBatch, loader
 from poet_loc.data.open_dataset import open_dataset
 from poet_loc.data.samples import PoseDataset
 from poet_loc.model.checkpoint import ModelConfig
+from poet_loc.model.device import device_of
 from poet_loc.model.losses import PoseLoss
 from poet_loc.model.poet import PoET
 from poet_loc.train.options import RecipeOptions, TrainOptions
@@ -35,7 +36,7 @@ def train(options: TrainOptions) -> Path:
     Started by torchrun, several processes share each batch's gradients; the batch of the options is that of one of
     them.  Raises InputError for data, weights or folders that do not fit.
     """
-    device = _device(options.device)
+    device = device_of(options.device)
     with process_group(device):
         return _Run(options, device).work()
 
@@ -60,11 +61,14 @@ class _Run:
         self.loss = PoseLoss(self.network.options, options.loss, options.boxes, _symmetries(options, ids))
         self.multiple = self.network.detector.shape().multiple
         self.rank, self.world = rank_and_world()
+        if len(self.dataset) < options.recipe.batch * self.world:
+            whole = options.recipe.batch * self.world
+            raise InputError(f"{len(self.dataset)} images do not fill one batch of {whole}", path=data.train)
         self.progress = Progress()
         if options.resume:
             self.progress = load_progress(options, self.network, self.optimizer)
         elif self.rank == 0:
-            begin(options, anew)
+            begin(options, self.config, anew)
         wait_for_all()
 
     def work(self) -> Path:
@@ -91,9 +95,6 @@ class _Run:
         order = EpochBatches(
             len(samples), options.recipe.batch, at.epoch, options.seed, True, self.rank, self.world, at.batch
         )
-        if len(order) == 0 and at.batch == 0:
-            whole = options.recipe.batch * self.world
-            raise InputError(f"{len(samples)} images do not fill one batch of {whole}", path=options.data.train)
         yield from loader(samples, order, self.multiple, options.data.workers)
 
     def _step(self, batch: TrainingBatch, board: Any) -> None:
@@ -193,15 +194,6 @@ def _symmetries(options: TrainOptions, ids: tuple[int, ...]) -> dict[int, Symmet
     models = read_models_info(options.models_info)
     symmetries = {label: models[i].symmetry for label, i in enumerate(ids, start=1) if i in models}
     return {label: symmetry for label, symmetry in symmetries.items() if symmetry is not None}
-
-
-def _device(name: str) -> torch.device:
-    if name == "auto":
-        name = "cuda" if torch.cuda.is_available() else "cpu"
-    device = torch.device(name)
-    if device.type == "cuda" and not torch.cuda.is_available():
-        raise InputError("there is no GPU here", fix="give --device cpu")
-    return device
 
 
 @contextmanager

@@ -36,13 +36,14 @@ def plain(options: Any) -> Any:
     return json.loads(json.dumps(asdict(options), default=str))
 
 
-def begin(options: TrainOptions, anew: list[str]) -> None:
+def begin(options: TrainOptions, config: ModelConfig, anew: list[str]) -> None:
     """Make the run's folder and write what was asked.  Raises InputError for a folder that already has a run."""
     if options.out.exists() and any(options.out.iterdir()):
         raise InputError("already holds a run", path=options.out, fix="give --resume, or another folder")
     options.out.mkdir(parents=True, exist_ok=True)
     about = {
         "options": plain(options),
+        "model": config.to_json(),
         "started_at_random": anew,
         "versions": {"python": platform.python_version(), "torch": torch.__version__},
         "threads": torch.get_num_threads(),

@@ -34,8 +34,9 @@ class Validation:
         return self.translation_m + LEVER_M * self.rotation_rad
 
     def to_json(self) -> dict[str, float]:
-        """Return the numbers by name."""
-        return {**asdict(self), "score": self.score}
+        """Return the numbers by name; without a match there are no errors."""
+        counts: dict[str, float] = {"matched": self.matched, "objects": self.objects}
+        return {**asdict(self), "score": self.score} if self.matched else counts
 
 
 def asked_queries(network: PoET, batch: TrainingBatch, mode: BoxMode) -> QueryBoxes | None:

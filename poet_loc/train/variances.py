@@ -10,10 +10,11 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from poet_loc.core.input_error import InputError
+from poet_loc.core.input_error import InputError, at_least
 from poet_loc.core.reliability import LEVELS, reliability, squared_mahalanobis, variance_factor
 from poet_loc.data.batches import EpochBatches, Samples, loader
 from poet_loc.data.open_dataset import open_dataset
+from poet_loc.io.whole_folder import not_there
 from poet_loc.model.checkpoint import load_model, save_model
 from poet_loc.model.heads import covariance_matrices
 from poet_loc.model.losses import rotation_vector
@@ -42,6 +43,12 @@ class CalibrateOptions:
     """By the median error, so that gross errors do not count; else by the mean squared error."""
     batch: int = 4
     workers: int = 0
+    overwrite: bool = False
+    """Replace what is there."""
+
+    def __post_init__(self) -> None:
+        at_least(1, self, "batch")
+        at_least(0, self, "workers")
 
 
 @dataclass(frozen=True)
@@ -66,6 +73,7 @@ def calibrate(options: CalibrateOptions) -> Calibration:
 
     Raises InputError for a network without uncertainty heads and for data in which nothing matches.
     """
+    not_there(options.target, options.overwrite)
     network, config = load_model(options.weights)
     if config.network.uncertainty == "none":
         raise InputError("the network tells no uncertainty", path=options.weights, fix="train its uncertainty heads")

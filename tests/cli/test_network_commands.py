@@ -87,3 +87,16 @@ def test_classes_and_hostile_checkpoints(tmp_path: Path, capsys: pytest.CaptureF
 def test_unknown_options_are_told_in_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert run("detect", tmp_path, "--out", tmp_path / "o", "--wheights", "x") == 1
     assert capsys.readouterr().err.count("\n") == 1
+
+
+def test_results_are_not_replaced_unasked(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    for name in ("net.onnx", "net.safetensors", "f.png"):
+        (tmp_path / name).write_text("mine")
+    data = ["--data", tmp_path, "--target", tmp_path / "new.safetensors", "--figure", tmp_path / "f.png"]
+    for command in (
+        ["export", tmp_path / "net.safetensors", tmp_path / "net.onnx"],
+        ["convert", "checkpoint", tmp_path / "net.pth", tmp_path / "net.safetensors"],
+        ["calibrate", "--weights", tmp_path / "net.safetensors", *data],
+    ):
+        assert run(*command) == 1
+        assert "is there already; choose another name or pass --overwrite" in capsys.readouterr().err

@@ -250,3 +250,35 @@ def test_old_torchvision_names() -> None:
         "backbone.0.rpn.head.conv.0.0.weight",
         "backbone.0.roi_heads.mask_head.3.0.bias",
     ]
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"args": argparse.Namespace(nheads="four", num_queries=5)}, "its args do not describe a network"),
+        ({"args": argparse.Namespace(nheads=4, num_queries=None)}, "does not say the number of queries"),
+        ({"args": argparse.Namespace(nheads=4, num_queries=0)}, "queries is 0"),
+        ({"args": argparse.Namespace(nheads=4, num_queries=5, dropout="little")}, "its args do not describe a network"),
+        ({"args": argparse.Namespace(nheads=4, num_queries=5, reference_points="grid")}, "reference_points is 'grid'"),
+        ({"args": "nheads=4"}, "its args are a str"),
+    ],
+)
+def test_arguments_that_describe_no_network(fixture_a: FixtureA, tmp_path: Path, changes: dict, message: str) -> None:
+    torch.save({"model": fixture_a.state_dict, "epoch": 1, **changes}, tmp_path / "in.pth")
+    with pytest.raises(InputError, match=message) as error:
+        convert_checkpoint(ConvertCheckpoint(tmp_path / "in.pth", tmp_path / "out.safetensors"))
+    assert "in.pth" in str(error.value)
+    assert not (tmp_path / "out.safetensors").exists()
+
+
+def test_a_file_that_is_there_is_not_replaced_unasked(fixture_a: FixtureA, tmp_path: Path) -> None:
+    torch.save(fixture_a.state_dict, tmp_path / "in.pth")
+    options = ConvertCheckpoint(tmp_path / "in.pth", tmp_path / "out.safetensors", heads=4, queries=5)
+    convert_checkpoint(options)
+    before = options.target.read_bytes()
+    with pytest.raises(InputError, match="is there already"):
+        convert_checkpoint(replace(options, queries=6))
+    assert options.target.read_bytes() == before
+    assert convert_checkpoint(replace(options, queries=6, overwrite=True)).network.queries == 6
+    with pytest.raises(InputError, match="is a folder"):
+        convert_checkpoint(replace(options, target=tmp_path))

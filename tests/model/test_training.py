@@ -7,6 +7,7 @@ import os
 import shutil
 import subprocess
 import sys
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -19,6 +20,7 @@ from tiny_data import save_tiny, write_bop_split
 from poet_loc.core.input_error import InputError
 from poet_loc.core.records import Symmetry
 from poet_loc.model.checkpoint import load_model
+from poet_loc.model.device import device_of
 from poet_loc.model.losses import (
     LossOptions,
     PoseLoss,
@@ -100,6 +102,23 @@ def test_resuming_another_run_or_overwriting_one_is_refused(tmp_path: Path) -> N
         train(replace(options, resume=True, seed=7))
     with pytest.raises(InputError, match="no run to go on with"):
         train(replace(options, resume=True, out=tmp_path / "elsewhere"))
+
+
+def test_a_batch_that_nothing_fills_leaves_no_run_behind(tmp_path: Path) -> None:
+    options = tiny_run(tmp_path)
+    with pytest.raises(InputError, match="6 images do not fill one batch of 7"):
+        train(replace(options, recipe=replace(options.recipe, batch=7)))
+    assert not options.out.exists()
+
+
+def test_the_run_tells_which_network_it_trained(tmp_path: Path) -> None:
+    options = tiny_run(tmp_path, max_steps=1, uncertainty="full")
+    train(options)
+    about = json.loads((options.out / "options.json").read_text())
+    assert about["model"]["network"]["hidden_dim"] == 32  # of the file that it started from, not of the options
+    assert about["model"]["network"]["uncertainty"] == "full"
+    assert about["model"]["detector"]["kind"] == "small"
+    assert any("covariance" in name for name in about["started_at_random"])
 
 
 def test_uncertainty_heads_alone(tmp_path: Path) -> None:
@@ -318,3 +337,21 @@ def test_likelihood_against_scipy() -> None:
     diagonal = gaussian_loss(torch.from_numpy(error), torch.from_numpy(numbers[:, :3] * 2))
     as_full = np.concatenate([numbers[:, :3], np.zeros((4, 3))], axis=1)
     assert diagonal.item() == pytest.approx(gaussian_loss(torch.from_numpy(error), torch.from_numpy(as_full)).item())
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda: RecipeOptions(batch=0), "batch is 0; give at least 1"),
+        (lambda: RecipeOptions(drop_epochs=0), "drop-epochs is 0"),
+        (lambda: RecipeOptions(learning_rate=float("nan")), "learning-rate is nan"),
+        (lambda: TrainOptions(Path("run"), DataOptions(Path("data")), validate_every=0), "validate-every is 0"),
+        (lambda: TrainOptions(Path("run"), DataOptions(Path("data")), max_steps=0), "max-steps is 0"),
+        (lambda: device_of("gpu"), "unknown device 'gpu'"),
+        (lambda: device_of("cuda:99"), "there is no GPU 99 here"),
+    ],
+)
+def test_impossible_numbers_and_devices(change: Callable[[], object], message: str) -> None:
+    with pytest.raises(InputError, match=message):
+        change()
+    assert device_of("auto").type in ("cpu", "cuda")

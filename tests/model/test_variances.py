@@ -55,7 +55,9 @@ def test_a_network_is_calibrated_on_data(kind: str, tmp_path: Path) -> None:
     assert replace(mended, variance_scale=(1.0, 1.0)) == config
     for name, tensor in network.state_dict().items():
         torch.testing.assert_close(loaded.state_dict()[name], tensor, atol=0, rtol=0)
-    robust = calibrate(replace(options, robust=True))
+    with pytest.raises(InputError, match="is there already"):
+        calibrate(options)
+    robust = calibrate(replace(options, robust=True, overwrite=True))
     at_half = found.levels.index(0.5)
     assert robust.after["translation"][at_half] == pytest.approx(0.5, abs=0.01)
     assert robust.after["rotation"][at_half] == pytest.approx(0.5, abs=0.01)

@@ -21,14 +21,15 @@ class Arguments:
     """Attention heads, if the file does not say."""
     queries: int | None = None
     """Object queries, if the file does not say."""
+    overwrite: bool = False
+    """Replace the file."""
 
 
 def execute(arguments: Arguments) -> None:
     """Convert and say what came out."""
     from poet_loc.model.official_checkpoint import ConvertCheckpoint, convert_checkpoint
 
-    options = ConvertCheckpoint(arguments.source, arguments.target, arguments.heads, arguments.queries)
-    config = convert_checkpoint(options)
+    config = convert_checkpoint(ConvertCheckpoint(**vars(arguments)))
     network = config.network
     print(
         f"{arguments.target}: {network.encoder_layers} + {network.decoder_layers} layers, {network.heads} heads,"
