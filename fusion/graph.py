@@ -35,7 +35,8 @@ def run_fixed_lag(problem: Problem, options: FuseOptions) -> FuseResult:
     began = time.perf_counter()
     walk = Walk(problem, options)
     m, chain = walk.memory, MotionChain.of(problem, options)
-    builder = GraphBuilder(problem.layout, m.x, m.bias_model, chain, options.graph)
+    fixed = options.graph.relinearize_every == 0
+    builder = GraphBuilder(problem.layout, m.x, m.bias_model, chain, options.graph, fixed)
     smoother: FixedLagSmoother | None = None
     for keyframe in walk.keyframes():
         if keyframe.started or smoother is None:

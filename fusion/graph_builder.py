@@ -11,7 +11,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fusion import eskf
-from fusion.graph_factors import Detection, Model, bias_factor, measurement_factor
+from fusion.eskf import ACCEPTED
+from fusion.fuse import LoopColumns
+from fusion.graph_factors import Detection, Model, bias_factor, common_variables, linear_factor, measurement_factor
+from fusion.graph_linear import KERNELS, linearise
 from fusion.graph_model import bias_step
 from fusion.graph_motion import MotionChain
 from fusion.graph_odometry import OdometryStep, odometry_factor
@@ -26,7 +29,7 @@ from fusion.graph_variables import (
     pose_key,
     static_variables,
 )
-from fusion.measurements import OBJECT_POSE
+from fusion.measurements import OBJECT_POSE, ODOMETRY_STEP
 from fusion.nav_state import OBJECT_SIZE, StateLayout
 from fusion.options import Graph
 
@@ -48,6 +51,10 @@ class BiasModel:
     def jumped(self, kind: int) -> Array:
         """Return the 1-sigma (6,) of a bias that was forgotten: the varying one has jumped."""
         return self.stationary(kind) * (float(self.values[eskf.BIAS_JUMP]) if kind == 0 else 1.0)
+
+    def constant(self, kind: int) -> bool:
+        """Tell whether a kind of bias stays as it is for ever."""
+        return bool(self.values[kind * eskf.BIAS_MODEL_SIZE + eskf.BIAS_TAU] == np.inf)
 
     def step(self, kind: int, mean: Array, seconds: float) -> tuple[Array, Array]:
         """Return factor and 1-sigma, each (6,), of what a bias does in some seconds (`eskf.decay_biases`)."""
@@ -76,14 +83,24 @@ class GraphBuilder:
     """Collects what a new keyframe adds: factors, initial values, and the keyframe at which each variable came.
 
     Object poses, where they are estimated, and extrinsics, time offset and gravity are one variable each. An object's
-    bias has a variable per keyframe that sees the object. x is the nominal array from which new variables start, clone
-    the keyframe of the last odometry, -1 where there was none.
+    bias has a variable per keyframe that sees the object. x is the nominal array from which new variables start, origin
+    the one where the newest did, clone the keyframe of the last odometry, -1 where there was none.
     """
 
-    def __init__(self, layout: StateLayout, x: Array, bias_model: Array, chain: MotionChain, options: Graph) -> None:
+    def __init__(
+        self,
+        layout: StateLayout,
+        x: Array,
+        bias_model: Array,
+        chain: MotionChain,
+        options: Graph,
+        fixed: bool = False,
+    ) -> None:
+        """fixed: what is added stays linearised where it was."""
         self.layout, self.bias_model, self.chain = layout, BiasModel(bias_model.copy()), chain
         self.model = Model(layout, x.copy(), chain.with_imu, options)
-        self.keyframe, self.stamp_ns, self.x = -1, 0, x.copy()
+        self.keyframe, self.stamp_ns, self.x, self.origin = -1, 0, x.copy(), x.copy()
+        self.fixed = fixed
         self.chains: dict[tuple[int, int], BiasChain] = {}
         self._statics: dict[int, Variable] = {}
         self._bias_count = 0
@@ -98,7 +115,7 @@ class GraphBuilder:
         """Return a copy, of a builder whose additions have been taken, that may go its own way."""
         other = copy.copy(self)
         other._clear()
-        other.x, other._statics = self.x.copy(), self._statics.copy()
+        other.x, other.origin, other._statics = self.x.copy(), self.origin.copy(), self._statics.copy()
         other.chains = {which: copy.copy(chain) for which, chain in self.chains.items()}
         return other
 
@@ -142,6 +159,7 @@ class GraphBuilder:
         """
         self._clear()
         self.x, layout, self.clone = x.copy() if start_from is None else start_from.copy(), self.layout, -1
+        self.origin = self.x.copy()
         self._statics = {variable.key: variable for variable in static_variables(layout)}
         for k in range(layout.n_objects if layout.objects else 0):
             if known[k] > 0.0:
@@ -159,6 +177,7 @@ class GraphBuilder:
 
     def _add(self, variable: Variable) -> None:
         variable.insert(self.values, self.x)
+        self.origin[variable.place] = self.x[variable.place]
         self.keyframes[variable.key] = self.keyframe
 
     def _add_keyframe(self, stamp_ns: int) -> None:
@@ -189,6 +208,52 @@ class GraphBuilder:
         if self.clone >= 0 and step.size > 0:
             self.graph.add(odometry_factor(step, self.clone, self.keyframe, self.model))
         self.clone = self.keyframe
+        self.origin[self._clone_variable().place] = self.origin[:OBJECT_SIZE]
+
+    def add_linearised(self, columns: LoopColumns, which: range) -> None:
+        """Add measurements that passed the gate to the newest keyframe, linearised where its variables start.
+
+        columns: rotations and covariances as the filter used them.
+        """
+        every, model = slice(which.start, which.stop), self.model
+        passed, kinds = columns.decisions[every] & ACCEPTED, columns.kinds[every]
+        passed[kinds == ODOMETRY_STEP] = 0
+        seen = dict.fromkeys(columns.objects[every][(passed > 0) & (kinds == OBJECT_POSE)].tolist())
+        private = {k: self._private_variables(k) for k in seen}
+        own, counts, shared, count = linearise(
+            which.start,
+            passed,
+            *columns[2:8],
+            self.stamp_ns,
+            self.chain.stamps_ns,
+            self.chain.values,
+            not self.chain.with_imu,
+            self.x,
+            self.origin,
+            model.integers,
+            KERNELS[model.options.kernel],
+            model.options.kernel_width,
+        )
+        moved = int(columns.stamps[which.start]) != self.stamp_ns
+        common = common_variables(self.layout, self.keyframe, self.chain.with_imu, moved)
+        first = own.shape[1]
+        for k, variables in private.items():
+            if counts[k]:
+                self.graph.add(
+                    linear_factor(
+                        own[k, : counts[k]], [*variables, *((key, first + at, size) for key, at, size in common)]
+                    )
+                )
+        if count:
+            self.graph.add(linear_factor(shared[:count], common))
+
+    def _private_variables(self, k: int) -> list[tuple[int, int, int]]:
+        """Return key, first column and size of what an object's measurements alone see; add what there is not yet."""
+        kinds, found = self.layout.bias_kinds, []
+        if self.layout.objects:
+            self._meet(k)
+            found = [(object_variable(self.layout, k).key, 6 * kinds, 6)]
+        return [(self._bias_here(k, kind), 6 * kind, 6) for kind in range(kinds)] + found
 
     def place_new_objects(self, x: Array) -> None:
         """Let objects that the graph has not met start where they stand in a nominal array."""
@@ -219,6 +284,8 @@ class GraphBuilder:
     def _bias_here(self, k: int, kind: int) -> int:
         """Return the key of an object's bias at the newest keyframe."""
         chain = self.chains[k, kind]
+        if chain.begun and self.unchanged(chain):
+            return chain.variable.key
         phi, sigma = self.step(chain)
         if not chain.begun:
             chain.sigma, chain.stamp_ns = np.hypot(phi * chain.sigma, sigma), self.stamp_ns
@@ -226,6 +293,10 @@ class GraphBuilder:
         elif sigma.any():
             self._add_bias(chain, phi, sigma)
         return chain.variable.key
+
+    def unchanged(self, chain: BiasChain) -> bool:
+        """Tell whether a bias is at the newest keyframe what its newest variable says."""
+        return chain.stamp_ns == self.stamp_ns or self.bias_model.constant(chain.kind)
 
     def step(self, chain: BiasChain) -> tuple[Array, Array]:
         """Return factor and 1-sigma, each (6,), from a bias's newest variable to the newest keyframe."""
@@ -241,6 +312,7 @@ class GraphBuilder:
             self.graph.addPriorVector(variable.key, np.zeros(6), gtsam.noiseModel.Diagonal.Sigmas(sigma))
         else:
             self.x[at : at + 6] *= phi
-            self.graph.add(bias_factor(before.key, variable.key, phi, sigma))
+            gap = phi * self.origin[at : at + 6] - self.x[at : at + 6] if self.fixed else None
+            self.graph.add(bias_factor(before.key, variable.key, phi, sigma, gap))
         chain.variable, chain.stamp_ns = variable, self.stamp_ns
         self._add(variable)

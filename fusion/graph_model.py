@@ -16,6 +16,7 @@ from fusion.nav_state import (
     EXTRINSIC_ROTATION,
     GRAVITY,
     GYRO_BIAS,
+    N_BIAS_KINDS,
     N_OBJECTS,
     OBJECT_SIZE,
     OBJECTS,
@@ -119,7 +120,7 @@ def bias_step(bias_model: Array, kind: int, mean: Array, seconds: float, left: A
         sigma[i] *= bias_model[model + BIAS_JUMP] if stays else 1.0
 
 
-@njit(cache=True)
+@njit(cache=True, _nrt=True)
 def detection_error(
     kind: int,
     k: int,
@@ -144,8 +145,6 @@ def detection_error(
     (4, 4), time offset (s) and biases (kinds, 6) as they are now; x: a nominal array, scratch but for its gravity.
     Jacobian columns as named above; poses in gtsam's tangent [rotation, translation in body axes].
     """
-    work, residual, H = np.zeros(256), np.zeros(6), np.zeros((6, MAX_COLUMNS))
-    columns = np.zeros(MAX_COLUMNS, dtype=np.int64)
     place(x, 0, T_world_imu)
     place(x, EXTRINSIC_ROTATION, T_imu_cam)
     x[TIME_OFFSET] = time_offset
@@ -156,10 +155,20 @@ def detection_error(
         for i in range(len(biases)):
             for j in range(6):
                 x[layout[BIASES] + 6 * (k + i * layout[N_OBJECTS]) + j] = biases[i, j]
+    return error_and_jacobian(kind, k, first, size, R_m, t_m, rate, motion, x, layout)
+
+
+@njit(cache=True, _nrt=True)
+def error_and_jacobian(
+    kind: int, k: int, first: int, size: int, R_m: Array, t_m: Array, rate: Array, motion: Array, x: Array, layout: Ints
+) -> tuple[Array, Array]:
+    """Return what `detection_error` says of a nominal array, which the motion then has carried on."""
+    work, residual, H = np.zeros(256), np.zeros(6), np.zeros((6, MAX_COLUMNS))
+    columns, biases = np.zeros(MAX_COLUMNS, dtype=np.int64), 6 * layout[N_BIAS_KINDS]
     R_k = np.copy(x[0:9])
     move(x, motion)
     residual_and_jacobian(kind, k, R_m, t_m, x, rate, 0.0, layout, residual, H, columns, work)
-    J = np.zeros((size, BIAS_COLUMNS + 6 * len(biases)))
+    J = np.zeros((size, BIAS_COLUMNS + biases))
     at = 6
     if layout[AT_EXTRINSICS] >= 0:
         _body_columns(H, at, J, EXTRINSIC_COLUMNS, first, x, EXTRINSIC_ROTATION)
@@ -169,9 +178,9 @@ def detection_error(
             _body_columns(H, at, J, OBJECT_COLUMNS, first, x, OBJECTS + OBJECT_SIZE * k)
             at += 6
         for r in range(size):
-            for c in range(6 * len(biases)):
+            for c in range(biases):
                 J[r, BIAS_COLUMNS + c] = H[first + r, at + c]
-        at += 6 * len(biases)
+        at += biases
     _pose_columns(H, J, first, R_k, motion, at if layout[AT_TIME_OFFSET] >= 0 else -1)
     return -residual[first : first + size], J
 

@@ -186,7 +186,8 @@ class GraphEstimator(Estimator):
         walk.cursor[ROWS] = 0
         while (keyframe := walk.next_keyframe(to_the_end=False)) is not None:
             if keyframe.started or self._smoother is None:
-                builder = GraphBuilder(self.layout, self.memory.x, self.memory.bias_model, chain, self.options.graph)
+                options, m = self.options.graph, self.memory
+                builder = GraphBuilder(self.layout, m.x, m.bias_model, chain, options, options.relinearize_every == 0)
                 self._smoother = FixedLagSmoother(builder, self.options.graph)
                 self._smoother.start(keyframe, walk)
             else:

@@ -13,15 +13,14 @@ from collections.abc import Sequence
 import gtsam
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import solve_triangular
+from scipy.linalg.lapack import dtrtri
 
 from fusion.eskf import ACCEPTED, POSITION_ONLY, ROTATION_ONLY, clone_pose
 from fusion.graph_builder import GraphBuilder
 from fusion.graph_factors import Detection
 from fusion.graph_odometry import odometry_at
-from fusion.graph_variables import block_diagonal
 from fusion.graph_walk import Keyframe, Walk
-from fusion.measurements import ODOMETRY_STEP
+from fusion.measurements import CAMERA_POSE, ODOMETRY_STEP
 from fusion.memory import Memory
 from fusion.options import Graph
 
@@ -35,8 +34,8 @@ class FixedLagSmoother:
         self.builder, self._options = builder, options
         self._window = max(1, round(options.lag_s * options.keyframe_rate_hz))
         self._isam = gtsam.ISAM2(isam_parameters(options))
-        self._came: dict[int, int] = {}
-        self._lasting: set[int] = set()
+        self._came: dict[int, list[int]] = {}  # per keyframe, what does not last
+        self._lasting: dict[int, None] = {}
         self._first = builder.keyframe + 1
         self._factors, self._theta = gtsam.NonlinearFactorGraph(), gtsam.Values()
 
@@ -55,12 +54,13 @@ class FixedLagSmoother:
         """Return a smoother that goes on from what was kept, its window eliminated anew."""
         other = self._copy()
         other._isam = gtsam.ISAM2(isam_parameters(self._options))
-        other._eliminate(self._factors, self._theta, self._came, True)
+        other._eliminate(self._factors, self._theta, True)
         return other
 
     def _copy(self) -> FixedLagSmoother:
         other = copy.copy(self)
-        other.builder, other._came, other._lasting = self.builder.fork(), self._came.copy(), self._lasting.copy()
+        other.builder, other._lasting = self.builder.fork(), self._lasting.copy()
+        other._came = {keyframe: keys.copy() for keyframe, keys in self._came.items()}
         return other
 
     def start(self, keyframe: Keyframe, walk: Walk) -> None:
@@ -74,11 +74,11 @@ class FixedLagSmoother:
         """Add a keyframe and what was measured since the last one; correct the filter's state with the result."""
         builder = self.builder
         builder.place_new_objects(walk.memory.x)
-        builder.add_detections(detections(builder, walk, keyframe.between))
+        add_measurements(builder, walk, keyframe.between)
         builder.add_keyframe(keyframe.stamp_ns)
         forget_biases(builder, keyframe)
         builder.add_odometry(odometry_at(walk, keyframe))
-        builder.add_detections(detections(builder, walk, keyframe.at))
+        add_measurements(builder, walk, keyframe.at)
         self._update()
         self._write_back(walk.memory)
 
@@ -86,23 +86,26 @@ class FixedLagSmoother:
         """Take in what is new and let the oldest go; variables are eliminated in order of time, lasting ones last."""
         newest, every = self.builder.keyframe, self._options.relinearize_every
         graph, values, came = self.builder.take()
-        lasting = {variable.key for variable in self.builder.lasting}
-        for key in self._lasting - lasting:
-            self._came[key] = newest - 1  # until now it was eliminated behind all keyframes before this one
-        self._came |= came
+        lasting = dict.fromkeys(variable.key for variable in self.builder.lasting)
+        for key in self._lasting:
+            if key not in lasting:  # until now it was eliminated behind all keyframes before this one
+                self._came.setdefault(newest - 1, []).append(key)
+        for key in lasting:
+            if key not in self._lasting and key not in came:  # a keyframe's pose that odometry is measured from
+                self._came[newest - 1].remove(key)
+        for key, keyframe in came.items():
+            if key not in lasting:
+                self._came.setdefault(keyframe, []).append(key)
         self._lasting = lasting
         anew = every > 0 and (newest - self._first) % every == every - 1
-        if not self._eliminate(graph, values, came, anew, anew):
-            self._eliminate(gtsam.NonlinearFactorGraph(), gtsam.Values(), {}, True)
+        if not self._eliminate(graph, values, anew, anew):
+            self._eliminate(gtsam.NonlinearFactorGraph(), gtsam.Values(), True)
+        if anew:
+            self._read_origin()
         self._let_go(newest - self._window)
 
     def _eliminate(
-        self,
-        graph: gtsam.NonlinearFactorGraph,
-        values: gtsam.Values,
-        came: dict[int, int],
-        whole: bool,
-        anew: bool = False,
+        self, graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, whole: bool, anew: bool = False
     ) -> bool:
         """Eliminate the end of the window or all of it, in order of time; tell whether that order is certain.
 
@@ -110,41 +113,58 @@ class FixedLagSmoother:
         their own (it does where cliques have merged, and all of them where most are concerned), the order of the oldest
         is left to chance, and they would be no leaves when they go.
         """
-        newest, recent = self.builder.keyframe, 3 if self.builder.chain.with_imu else 9
-        again = [key for key, k in self._came.items() if whole or k > newest - recent or key in self._lasting]
+        newest, recent = self.builder.keyframe, 2 if self.builder.chain.with_imu else 9
+        again = [*self._lasting]
+        for keyframe, keys in self._came.items():
+            if whole or keyframe > newest - recent:
+                again += keys
         oldest = max(self._first, newest + 2 - len(again))
-        groups, old, certain = gtsam.KeyGroupMap(), gtsam.KeyList(), 0
-        for key, keyframe in self._came.items():
-            lasts = key in self._lasting
-            groups.insert2(key, newest - oldest + 1 if lasts else max(0, keyframe - oldest))
-            certain += lasts or keyframe >= oldest
+        groups, old, certain = gtsam.KeyGroupMap(), gtsam.KeyList(), len(self._lasting)
+        for key in self._lasting:
+            groups.insert2(key, newest - oldest + 1)
+        for keyframe, keys in self._came.items():
+            for key in keys:
+                groups.insert2(key, max(0, keyframe - oldest))
+            certain += len(keys) if keyframe >= oldest else 0
         for key in again:
-            if key not in came:
+            if not values.exists(key):
                 old.push_back(key)
         result = self._isam.update(graph, values, [], groups, None, old, anew)
         return whole or int(result.getVariablesReeliminated()) <= certain
 
     def _let_go(self, until: int) -> None:
-        leaving = sorted((k, key) for key, k in self._came.items() if k <= until and key not in self._lasting)
         keys = gtsam.KeyList()
-        for _, key in leaving:
-            keys.push_back(key)
-            del self._came[key]
-        if leaving:
+        for keyframe in sorted(keyframe for keyframe in self._came if keyframe <= until):
+            for key in sorted(self._came.pop(keyframe)):
+                keys.push_back(key)
+        if keys.size():
             self._isam.marginalizeLeaves(keys)
 
+    def _read_origin(self) -> None:
+        """Read where the newest variables are linearised."""
+        theta = self._isam.getLinearizationPoint()
+        for variable in self.builder.newest:
+            variable.read(theta, self.builder.origin)
+
     def _write_back(self, m: Memory) -> None:
-        """Give the filter's memory the newest state and the joint covariance of all that it holds."""
+        """Give the filter's memory the newest state and the joint covariance of all that it holds.
+
+        The root of the joint information knows both: how far the newest variables have come from where they were
+        linearised, and how sure that is. So nothing older has to be solved for.
+        """
         builder, variables = self.builder, self.builder.newest
-        keys = [variable.key for variable in variables]
-        estimate = self._isam.calculateEstimate(keys)
+        root, step = newest_root(self._isam, [variable.key for variable in variables])
+        rows, first = [], 0
         for variable in variables:
-            variable.read(estimate, builder.x)
-            variable.read(estimate, m.x)
+            part, first = slice(first, first + variable.size), first + variable.size
+            builder.x[variable.place] = m.x[variable.place] = variable.moved(builder.origin, step[part])
+            rows.append(variable.rows_to_filter(builder.x, root[part]))
         at = [i for variable in variables for i in variable.errors]
-        J = block_diagonal([variable.to_filter(builder.x) for variable in variables])
-        P, begun = J @ joint_covariance(self._isam, keys) @ J.T, [c for c in builder.chains.values() if c.begun]
+        J_root = np.concatenate(rows)
+        P, begun = J_root @ J_root.T, [c for c in builder.chains.values() if c.begun]
         for n, chain in enumerate(begun):  # they are the last of the newest
+            if builder.unchanged(chain):
+                continue
             phi, sigma = builder.step(chain)
             first, place = 6 * (n - len(begun)) + len(at), chain.variable.at
             m.x[place : place + 6] *= phi
@@ -169,9 +189,15 @@ def isam_parameters(options: Graph) -> gtsam.ISAM2Params:
 
 def joint_covariance(tree: gtsam.ISAM2 | gtsam.GaussianBayesTree, keys: Sequence[int]) -> Array:
     """Return the joint marginal covariance of variables in this order, by QR: gtsam's own way takes Cholesky."""
-    R, _ = tree.jointBayesNet(keys, gtsam.EliminateQR).matrix()
-    root = solve_triangular(R, np.eye(len(R)), check_finite=False)
+    root, _ = newest_root(tree, keys)
     return np.asarray(root @ root.T)
+
+
+def newest_root(tree: gtsam.ISAM2 | gtsam.GaussianBayesTree, keys: Sequence[int]) -> tuple[Array, Array]:
+    """Return a root of the joint covariance of variables in this order, and their step from the linearisation."""
+    R, d = tree.jointBayesNet(keys, gtsam.EliminateQR).matrix()
+    root, _ = dtrtri(R)
+    return root, root @ d
 
 
 def forget_biases(builder: GraphBuilder, keyframe: Keyframe) -> None:
@@ -179,6 +205,19 @@ def forget_biases(builder: GraphBuilder, keyframe: Keyframe) -> None:
     for i, half in np.argwhere(keyframe.forgotten):
         kind, k = divmod(int(i), builder.layout.n_objects)
         builder.forget(k, kind, int(half))
+
+
+def add_measurements(builder: GraphBuilder, walk: Walk, which: range) -> None:
+    """Add the measurements that passed the gate to the newest keyframe, together where the graph lets them be."""
+    if not which:
+        return
+    c, layout = walk.columns, builder.layout
+    whole = c.stamps[which[0]] == builder.stamp_ns and not (layout.extrinsics or layout.time_offset)
+    native = whole and CAMERA_POSE in c.kinds[which.start : which.stop]  # gtsam has a factor for it
+    if builder.fixed and not native:
+        builder.add_linearised(walk.fitted, which)
+    else:
+        builder.add_detections(detections(builder, walk, which))
 
 
 def detections(builder: GraphBuilder, walk: Walk, which: range) -> list[Detection]:

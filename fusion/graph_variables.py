@@ -99,13 +99,26 @@ class Variable:
         """Add it to values with what stands in the nominal array."""
         values.insert(self.key, x[self.at : self.at + self.size])
 
+    @property
+    def place(self) -> slice:
+        """Its place in the nominal array."""
+        return slice(self.at, self.at + self.size)
+
     def read(self, values: gtsam.Values, x: Array) -> None:
         """Write its value into the nominal array."""
         x[self.at : self.at + self.size] = values.atVector(self.key)
 
+    def moved(self, x: Array, step: Array) -> Array:
+        """Return what stands in its place of the nominal array after a step in gtsam's tangent."""
+        return np.asarray(x[self.place] + step)
+
     def to_filter(self, x: Array) -> Array:
         """Return the derivative of the filter's errors by gtsam's tangent."""
         return np.eye(self.size)
+
+    def rows_to_filter(self, x: Array, rows: Array) -> Array:
+        """Return to_filter(x) @ rows."""
+        return rows
 
     def from_filter(self, x: Array) -> Array:
         """Return the derivative of gtsam's tangent by the filter's errors."""
@@ -129,9 +142,23 @@ class PoseVariable(Variable):
         x[self.at : self.at + 9] = T.rotation().matrix().ravel()
         x[self.at + 9 : self.at + 12] = T.translation()
 
+    @property
+    def place(self) -> slice:
+        """Its place in the nominal array."""
+        return slice(self.at, self.at + OBJECT_SIZE)
+
+    def moved(self, x: Array, step: Array) -> Array:
+        """Return what stands in its place of the nominal array after a step in gtsam's tangent."""
+        T = pose3(x, self.at).retract(step).matrix()
+        return np.concatenate([T[:3, :3].ravel(), T[:3, 3]])
+
     def to_filter(self, x: Array) -> Array:
         """Return the derivative of the filter's errors by gtsam's tangent."""
         return block_diagonal([_EYE, x[self.at : self.at + 9].reshape(3, 3)])
+
+    def rows_to_filter(self, x: Array, rows: Array) -> Array:
+        """Return to_filter(x) @ rows."""
+        return np.concatenate([rows[:3], x[self.at : self.at + 9].reshape(3, 3) @ rows[3:]])
 
 
 class CloneVariable(PoseVariable):
@@ -140,6 +167,10 @@ class CloneVariable(PoseVariable):
     def to_filter(self, x: Array) -> Array:
         """Return the derivative of [xi, rho], R_true = Exp(xi) R and p_true = Exp(xi) p + rho, by gtsam's tangent."""
         return np.asarray(pose3(x, self.at).AdjointMap())
+
+    def rows_to_filter(self, x: Array, rows: Array) -> Array:
+        """Return to_filter(x) @ rows."""
+        return np.asarray(self.to_filter(x) @ rows)
 
 
 class ImuBiasVariable(Variable):
@@ -154,9 +185,17 @@ class ImuBiasVariable(Variable):
         bias = values.atConstantBias(self.key)
         x[GYRO_BIAS : GYRO_BIAS + 3], x[ACCEL_BIAS : ACCEL_BIAS + 3] = bias.gyroscope(), bias.accelerometer()
 
+    def moved(self, x: Array, step: Array) -> Array:
+        """Return what stands in its place of the nominal array after a step in gtsam's tangent."""
+        return np.asarray(x[self.place] + self.rows_to_filter(x, step))
+
     def to_filter(self, x: Array) -> Array:
         """Return the derivative of the filter's errors by gtsam's tangent."""
         return np.roll(np.eye(6), 3, axis=0)
+
+    def rows_to_filter(self, x: Array, rows: Array) -> Array:
+        """Return to_filter(x) @ rows."""
+        return np.concatenate([rows[3:], rows[:3]])
 
 
 class GravityVariable(Variable):
@@ -170,6 +209,10 @@ class GravityVariable(Variable):
     def to_filter(self, x: Array) -> Array:
         """Return the derivative of the filter's errors by gtsam's tangent."""
         return np.asarray(np.linalg.pinv(self.from_filter(x)))
+
+    def rows_to_filter(self, x: Array, rows: Array) -> Array:
+        """Return to_filter(x) @ rows."""
+        return np.asarray(self.to_filter(x) @ rows)
 
     def from_filter(self, x: Array) -> Array:
         """Return the derivative of gtsam's tangent by the filter's errors."""

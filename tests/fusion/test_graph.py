@@ -83,7 +83,8 @@ def test_the_window_stays_bounded_however_long_the_log(monkeypatch):
         extend(self, keyframe, walk)
         factors = self._isam.getFactorsUnsafe()
         alive = sum(factors.at(i) is not None for i in range(factors.size()))
-        sizes.append((len(self._came), alive, factors.size(), self._isam.calculateEstimate().size()))
+        variables = len(self._lasting) + sum(len(keys) for keys in self._came.values())
+        sizes.append((variables, alive, factors.size(), self._isam.calculateEstimate().size()))
 
     monkeypatch.setattr(FixedLagSmoother, "extend", watched)
     options = replace(GRAPH, graph=Graph(lag_s=0.5, idle_s=0.3))
@@ -95,7 +96,9 @@ def test_the_window_stays_bounded_however_long_the_log(monkeypatch):
     np.testing.assert_array_equal(sizes[:, 0], sizes[:, 3])
 
 
-def test_the_marginal_covariance_is_the_inverse_of_the_information(monkeypatch):
+@pytest.mark.parametrize("relinearize_every", [0, 3])
+def test_newest_state_and_covariance_are_those_of_the_whole_window(monkeypatch, relinearize_every):
+    """The covariance is the inverse of the information, the state what ISAM2 finds when it solves for everything."""
     checked = []
     extend = FixedLagSmoother.extend
 
@@ -106,7 +109,8 @@ def test_the_marginal_covariance_is_the_inverse_of_the_information(monkeypatch):
         keys = [variable.key for variable in self.builder.newest]
         linear = self._isam.getFactorsUnsafe().linearize(self._isam.getLinearizationPoint())
         ordering = gtsam.Ordering()
-        for key in [*keys, *(key for key in self._came if key not in keys)]:
+        older = [key for came in self._came.values() for key in came if key not in keys]
+        for key in [*keys, *older]:
             ordering.push_back(key)
         A, _ = linear.jacobian(ordering)
         size = sum(variable.size for variable in self.builder.newest)
@@ -115,10 +119,15 @@ def test_the_marginal_covariance_is_the_inverse_of_the_information(monkeypatch):
         dense, own = dense[:size, :size], joint_covariance(self._isam, keys)
         sigma = np.sqrt(np.diag(dense))
         np.testing.assert_allclose(own / np.outer(sigma, sigma), dense / np.outer(sigma, sigma), atol=1e-5)
+        for variable in self.builder.newest:
+            from_root = self.builder.x[variable.place].copy()
+            variable.read(self._isam.calculateEstimate(), self.builder.x)
+            np.testing.assert_allclose(from_root, self.builder.x[variable.place], atol=1e-9)
         checked.append(size)
 
     monkeypatch.setattr(FixedLagSmoother, "extend", watched)
-    options = replace(GRAPH, graph=Graph(lag_s=0.5, kernel="none"))
+    graph = Graph(lag_s=0.5, kernel="none", relinearize_every=relinearize_every, relinearize=1e-5)
+    options = replace(GRAPH, graph=graph)
     run_graph(simulated(duration_s=4.0, options=options), options)
     assert max(checked) > 15
 
