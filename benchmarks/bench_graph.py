@@ -1,109 +1,235 @@
 """The fixed-lag graph beside the bare gtsam calls on the same graph, paired in one run, at equal results.
 
-    python benchmarks/bench_graph.py [--seconds 20] [--objects 1 4 8] [--rounds 3]
+    python benchmarks/bench_graph.py [--seconds 20] [--objects 1 4 8] [--rounds 3] [--long 60]
 
-A simulated log with object poses at 30 Hz and an IMU at 200 Hz. Ours is the whole estimator: the filter between
-keyframes with its gate and rows at the IMU's rate, preintegration, making factors, and the joint covariance handed
-back. Bare are the calls that it made of gtsam's ISAM2 (update, marginalise, estimate, joint covariance) made again with
-the same factors, nothing else. The peer is gtsam's IncrementalFixedLagSmoother (QR) fed the same factors, asked for
-the estimate of the newest pose only. Times are CPU times of this process per keyframe, medians over the rounds. The
-bare calls must end in our last pose, or the run ends with an error.
+A simulated log with object poses at 30 Hz and an IMU at 200 Hz. **Ours** is the whole estimator: the filter between
+keyframes with its gate and rows at the IMU's rate, what makes the graph of it, and the joint covariance handed back.
+**Bare** is the program that someone writes who has gtsam, the same keyframes and all numbers ready: preintegrate each
+IMU sample, make one factor per measurement (a CustomFactor on our compiled error: gtsam has none) and per step of a
+bias, insert initial values, call ISAM2 (update in our order of elimination, marginalise), ask for the newest state and
+its joint covariance. **Solver** are ISAM2's calls alone as ours makes them, on factors that are ready. **Peer** is
+gtsam's IncrementalFixedLagSmoother (QR) fed with bare's factors, ready, asked for the newest pose only. Times are CPU
+times of this process per keyframe, medians over the rounds. All but the peer must end in our last pose, or the run
+ends with an error.
+
+--long: the online graph, fed for so many seconds: time per keyframe and memory early and late.
 """
 
 from __future__ import annotations
 
 import argparse
+import gc
 import statistics
 import sys
 import time
-from collections.abc import Callable
-from dataclasses import dataclass, field
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
 from typing import Any
+from unittest.mock import patch
 
 import gtsam
 import numpy as np
 
-from fusion import graph_smoother
+from fusion import graph_builder, graph_factors, graph_smoother
 from fusion.graph import run_graph
-from fusion.graph_smoother import FixedLagSmoother
+from fusion.graph_factors import bias_factor, robust
+from fusion.graph_motion import MotionChain
+from fusion.graph_online import GraphEstimator
+from fusion.graph_smoother import FixedLagSmoother, joint_covariance
 from fusion.graph_variables import pose_key
 from fusion.options import FuseOptions
-from fusion.prepare import pose_problem
+from fusion.prepare import pose_problem, time_shift_ns
 from fusion.simulate import SimulationOptions, simulate
 
 TOLERANCE_M = 1e-6
 
 
+Make = Callable[[], Any]
+
+
 @dataclass
-class Tape:
-    """What the estimator asked of gtsam."""
+class Keyframe:
+    """What is asked of gtsam for one keyframe."""
 
+    factors: list[Make] = field(default_factory=list)
+    values: list[tuple[int, Make]] = field(default_factory=list)
+    lasting: list[int] = field(default_factory=list)
+    """Variables that stay."""
     calls: list[tuple[str, tuple[Any, ...]]] = field(default_factory=list)
-    lasting: list[list[int]] = field(default_factory=list)
-    """Per update: variables that stay."""
+    """Of ISAM2, in this order."""
+    newest: Sequence[int] = ()
 
 
-def recording(tape: Tape) -> type:
+def recording(tape: list[Keyframe]) -> type:
     """Return an ISAM2 that writes its calls down."""
 
     class Recorded(gtsam.ISAM2):
         def update(self, *arguments: Any) -> Any:
-            tape.calls.append(("update", arguments))
+            tape[-1].calls.append(("update", arguments))
             return super().update(*arguments)
 
         def marginalizeLeaves(self, keys: Any) -> None:
-            tape.calls.append(("marginalizeLeaves", (keys,)))
+            tape[-1].calls.append(("marginalizeLeaves", (keys,)))
             super().marginalizeLeaves(keys)
 
-        def calculateEstimate(self, keys: Any) -> Any:
-            tape.calls.append(("calculateEstimate", (keys,)))
-            return super().calculateEstimate(keys)
-
         def jointBayesNet(self, *arguments: Any) -> Any:
-            tape.calls.append(("jointBayesNet", arguments))
+            tape[-1].calls.append(("jointBayesNet", arguments))
+            tape[-1].newest = arguments[0]
             return super().jointBayesNet(*arguments)
 
     return Recorded
 
 
-def record(problem: Any, options: FuseOptions) -> Tape:
-    tape, own, update = Tape(), gtsam.ISAM2, FixedLagSmoother._update
+def record(problem: Any, options: FuseOptions) -> list[Keyframe]:
+    """Return what the estimator asks of gtsam."""
+    tape, update, take = [Keyframe()], FixedLagSmoother._update, graph_builder.GraphBuilder.take
 
-    def watched(self: FixedLagSmoother) -> None:
-        tape.lasting.append([variable.key for variable in self.builder.lasting])
+    def watched_update(self: FixedLagSmoother) -> None:
+        tape[-1].lasting = [variable.key for variable in self.builder.lasting]
         update(self)
 
-    graph_smoother.gtsam.ISAM2, FixedLagSmoother._update = recording(tape), watched
-    try:
+    def watched_take(self: graph_builder.GraphBuilder) -> Any:
+        added = take(self)
+        tape[-1].values = [(key, _maker(added[1], key)) for key in list(added[1].keys())]
+        return added
+
+    extend = FixedLagSmoother.extend
+
+    def watched_extend(self: FixedLagSmoother, *arguments: Any) -> None:
+        tape.append(Keyframe())
+        extend(self, *arguments)
+
+    with (
+        patch.object(graph_smoother.gtsam, "ISAM2", recording(tape)),
+        patch.object(FixedLagSmoother, "_update", watched_update),
+        patch.object(FixedLagSmoother, "extend", watched_extend),
+        patch.object(graph_builder.GraphBuilder, "take", watched_take),
+    ):
         run_graph(problem, options)
-    finally:
-        graph_smoother.gtsam.ISAM2, FixedLagSmoother._update = own, update
     return tape
 
 
-def bare(tape: Tape, options: FuseOptions) -> gtsam.Pose3:
-    """Make the recorded calls."""
+def record_factors(problem: Any, options: FuseOptions) -> list[Keyframe]:
+    """Return the same with a maker of every factor: those that a graph has whose factors can be called again."""
+    made: list[list[Make]] = [[]]
+    covariances: list[Any] = []
+    steps: list[Any] = []
+
+    def note_robust(kernel: Any, covariance: Any) -> Any:
+        covariances.append(covariance.copy())
+        return robust(kernel, covariance)
+
+    custom, links = gtsam.CustomFactor, MotionChain.link
+    combined, preintegrated = gtsam.CombinedImuFactor, gtsam.PreintegratedCombinedMeasurements
+
+    def note_custom(_: Any, keys: Any, error: Any) -> Any:
+        covariance = covariances[-1]
+        made[-1].append(lambda: custom(robust(options.graph, covariance), keys, error))
+        return made[-1][-1]()
+
+    def note_bias(*arguments: Any) -> Any:
+        made[-1].append(lambda: bias_factor(*arguments[:4]))
+        return bias_factor(*arguments)
+
+    class Noted(preintegrated):  # type: ignore[misc, valid-type]
+        def __init__(self, parameters: Any, bias: Any) -> None:
+            steps[:] = [(parameters, bias)]
+            super().__init__(parameters, bias)
+
+        def integrateMeasurement(self, *step: Any) -> None:
+            steps.append(tuple(np.array(one) for one in step))
+            super().integrateMeasurement(*step)
+
+    def note_link(self: MotionChain, *arguments: Any) -> Any:
+        factor, predicted = links(self, *arguments)
+        (parameters, bias), *samples = steps
+        keys = list(factor.keys())
+
+        def make() -> Any:
+            summed = preintegrated(parameters, bias)
+            for force, rate, seconds in samples:
+                summed.integrateMeasurement(force, rate, seconds)
+            return combined(*keys, summed)
+
+        made[-1].append(make)
+        return factor, predicted
+
+    take = graph_builder.GraphBuilder.take
+
+    def note_take(self: graph_builder.GraphBuilder) -> Any:
+        every = [self.graph.at(i) for i in range(self.graph.size())]
+        priors = every if len(made) == 1 else [f for f in every if isinstance(f, gtsam.PriorFactorVector)]
+        made[-1] += [lambda prior=prior: prior for prior in priors]  # few, and ready
+        made.append([])
+        return take(self)
+
+    with (
+        patch.object(graph_factors, "robust", note_robust),
+        patch.object(graph_factors.gtsam, "CustomFactor", note_custom),
+        patch.object(graph_builder, "bias_factor", note_bias),
+        patch.object(graph_factors.gtsam, "PreintegratedCombinedMeasurements", Noted),
+        patch.object(MotionChain, "link", note_link),
+        patch.object(graph_builder.GraphBuilder, "take", note_take),
+    ):
+        again = replace(options, graph=replace(options.graph, relinearize_every=10**9))  # able to, but never does
+        tape = record(problem, again)
+    for keyframe, factors in zip(tape, made, strict=False):
+        keyframe.factors = factors
+    return tape
+
+
+def _maker(values: gtsam.Values, key: int) -> Make:
+    """Return what makes a variable's value anew from its numbers."""
+    kind = chr(gtsam.Symbol(key).chr())
+    if kind in "xeo":
+        T = values.atPose3(key).matrix()
+        return lambda: gtsam.Pose3(T)
+    if kind == "b":
+        bias = values.atConstantBias(key)
+        force, rate = bias.accelerometer(), bias.gyroscope()
+        return lambda: gtsam.imuBias.ConstantBias(force, rate)
+    vector = values.atVector(key)
+    return lambda: vector
+
+
+def bare(tape: list[Keyframe], options: FuseOptions) -> gtsam.Pose3:
+    """Build and solve the graph by gtsam alone."""
     isam = gtsam.ISAM2(graph_smoother.isam_parameters(options.graph))
-    for name, arguments in tape.calls:
-        found = getattr(isam, name)(*arguments)
-        if name == "calculateEstimate":
-            estimate = found
-    return newest_pose(estimate)
+    for keyframe in tape:
+        graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
+        for make in keyframe.factors:
+            graph.add(make())
+        for key, make in keyframe.values:
+            values.insert(key, make())
+        for name, arguments in keyframe.calls:
+            if name == "update" and arguments[0].size() > 0:
+                isam.update(graph, values, *arguments[2:])
+            elif name != "jointBayesNet":
+                getattr(isam, name)(*arguments)
+        if keyframe.newest:
+            joint_covariance(isam, keyframe.newest)
+            newest = isam.calculateEstimate(keyframe.newest)
+    return newest.atPose3(keyframe.newest[0])
 
 
-def newest_pose(estimate: gtsam.Values) -> gtsam.Pose3:
-    keys = estimate.keys()
-    return estimate.atPose3(max(key for key in keys if chr(gtsam.Symbol(key).chr()) == "x"))
+def solver(tape: list[Keyframe], options: FuseOptions) -> gtsam.ISAM2:
+    """Make the recorded calls of ISAM2."""
+    isam = gtsam.ISAM2(graph_smoother.isam_parameters(options.graph))
+    for keyframe in tape:
+        for name, arguments in keyframe.calls:
+            getattr(isam, name)(*arguments)
+    return isam
 
 
-def peer(tape: Tape, options: FuseOptions) -> gtsam.Pose3:
+def peer(tape: list[Keyframe], options: FuseOptions) -> gtsam.Pose3:
     """Feed gtsam's own fixed-lag smoother with the recorded factors, keyframe by keyframe."""
     params = graph_smoother.isam_parameters(options.graph)
     params.relinearizeSkip = 1
     smoother = gtsam.IncrementalFixedLagSmoother(options.graph.lag_s * options.graph.keyframe_rate_hz, params)
-    updates = [arguments for name, arguments in tape.calls if name == "update" and arguments[0].size() > 0]
-    for k, ((graph, values, *_), lasting) in enumerate(zip(updates, tape.lasting, strict=True)):
-        smoother.update(graph, values, dict.fromkeys([*values.keys(), *lasting], float(k)))
+    for k, keyframe in enumerate(tape):
+        graph, values = keyframe.calls[0][1][:2]
+        smoother.update(graph, values, dict.fromkeys([*values.keys(), *keyframe.lasting], float(k)))
         pose = smoother.calculateEstimatePose3(pose_key(k))
     return pose
 
@@ -114,30 +240,81 @@ def timed(function: Callable[..., Any], *arguments: Any) -> tuple[float, Any]:
     return time.process_time() - start, result
 
 
+def compare(objects: int, seconds: float, rounds: int) -> None:
+    """Print one row of the table."""
+    options = FuseOptions(estimator="graph")
+    problem = pose_problem(
+        simulate(SimulationOptions(duration_s=seconds, objects=objects, symmetric_objects=0)), options
+    )
+    own, by_hand = record(problem, options), record_factors(problem, options)
+    contestants = (run_graph, problem), (bare, by_hand), (solver, own), (peer, by_hand)
+    times: list[list[float]] = []
+    for _ in range(rounds):
+        row = [timed(function, on, options) for function, on in contestants]
+        times.append([spent for spent, _ in row])
+        last = row[0][1].T_world_imu.translation[-1]
+        ends = row[1][1].translation(), row[2][1].calculateEstimatePose3(own[-1].newest[0]).translation()
+        if max(np.linalg.norm(end - last) for end in ends) > TOLERANCE_M:
+            sys.exit(f"{objects} objects: the calls end in another pose")
+    ours, others, alone = (statistics.median(row[i] for row in times) * 1e3 / len(own) for i in range(3))
+    ratios = [statistics.median(row[a] / row[b] for row in times) for a, b in ((0, 1), (0, 2), (3, 0))]
+    print(
+        f"{objects:<8}{len(own):>10}{ours:10.2f}{others:10.2f}{alone:12.2f}"
+        f"{ratios[0]:13.2f}{ratios[1]:15.2f}{ratios[2]:13.1f}"
+    )
+
+
+def memory_mb() -> float:
+    """Return what this process holds in memory now."""
+    gc.collect()
+    return int(Path("/proc/self/statm").read_text().split()[1]) * 4096 / 1e6
+
+
+def run_long(seconds: float, objects: int) -> None:
+    """Feed the online graph and print time and memory per keyframe of each fifth of the way."""
+    log = simulate(SimulationOptions(duration_s=seconds, objects=objects, symmetric_objects=0))
+    options = FuseOptions(estimator="graph")
+    assert log.imu is not None
+    assert log.calibration is not None
+    estimator, imu, seen = GraphEstimator(log.calibration, log.landmark_map, options), log.imu, log.detections()[1]
+    q, shift_ns = seen.T_cam_obj.rotation.as_quat(), time_shift_ns(log.calibration)
+    extend, keyframes, m = FixedLagSmoother.extend, 0, 0
+
+    def counted(self: FixedLagSmoother, *arguments: Any) -> None:
+        nonlocal keyframes
+        keyframes += 1
+        extend(self, *arguments)
+
+    print(f"online, {objects} object(s)\n{'until, s':>10}{'keyframes':>12}{'ms each':>10}{'memory, MB':>13}")
+    with patch.object(FixedLagSmoother, "extend", counted):
+        for fifth in np.array_split(np.arange(len(imu.stamps_ns)), 5):
+            began, before = time.process_time(), keyframes
+            for i in fifth:
+                estimator.feed_imu(imu.stamps_ns[i], imu.angular_velocity[i], imu.specific_force[i])
+                while m < len(q) and seen.stamps_ns[m] + shift_ns <= imu.stamps_ns[i]:
+                    of = slice(m, int(np.searchsorted(seen.stamps_ns, seen.stamps_ns[m], side="right")))
+                    R = None if seen.covariances is None else seen.covariances[of]
+                    poses = seen.T_cam_obj.translation[of], q[of], R, seen.instances[of]
+                    estimator.feed_object_poses(seen.stamps_ns[m], seen.object_ids[of], *poses)
+                    m = of.stop
+            spent, count = time.process_time() - began, keyframes - before
+            until = (imu.stamps_ns[fifth[-1]] - imu.stamps_ns[0]) * 1e-9
+            print(f"{until:10.0f}{count:12}{spent * 1e3 / count:10.2f}{memory_mb():13.1f}", flush=True)
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--seconds", type=float, default=20.0)
     parser.add_argument("--objects", type=int, nargs="+", default=[1, 4, 8])
     parser.add_argument("--rounds", type=int, default=3)
+    parser.add_argument("--long", type=float, default=60.0)
     asked = parser.parse_args()
-    options = FuseOptions(estimator="graph")
-    print(f"{'objects':8}{'keyframes':>10}{'ours, ms':>10}{'bare, ms':>10}{'ours / bare':>13}{'peer / ours':>13}")
+    titles = f"{'objects':8}{'keyframes':>10}{'ours, ms':>10}{'bare, ms':>10}{'solver, ms':>12}"
+    print(f"{titles}{'ours / bare':>13}{'ours / solver':>15}{'peer / ours':>13}")
     for objects in asked.objects:
-        log = simulate(SimulationOptions(duration_s=asked.seconds, objects=objects, symmetric_objects=0))
-        problem = pose_problem(log, options)
-        tape = record(problem, options)
-        times: list[tuple[float, float, float]] = []
-        for _ in range(asked.rounds):
-            ours_s, result = timed(run_graph, problem, options)
-            bare_s, pose = timed(bare, tape, options)
-            times.append((ours_s, bare_s, timed(peer, tape, options)[0]))
-        count = len(tape.lasting)
-        ours, own = (statistics.median(column) * 1e3 / count for column in list(zip(*times, strict=True))[:2])
-        ratio = statistics.median(a / b for a, b, _ in times)
-        beside = statistics.median(c / a for a, _, c in times)
-        print(f"{objects:<8}{count:>10}{ours:10.2f}{own:10.2f}{ratio:13.2f}{beside:13.1f}")
-        if np.linalg.norm(result.T_world_imu.translation[-1] - pose.translation()) > TOLERANCE_M:
-            sys.exit(f"{objects} objects: the bare calls end in another pose")
+        compare(objects, asked.seconds, asked.rounds)
+    if asked.long > 0.0:
+        run_long(asked.long, asked.objects[0])
 
 
 if __name__ == "__main__":
