@@ -25,5 +25,5 @@ def reliability_figure(
         axis.plot(levels, after[name], color=BLUE, marker="s", markersize=2.5, label="after")
         axis.set(xlabel="probability of the ellipsoid", title=name, xlim=(0, 1), ylim=(0, 1), aspect="equal")
     axes[0].set_ylabel("share of errors inside")
-    figure.legend(*axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=3)
+    figure.legend(*axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=3, markerscale=1.5)
     return figure
