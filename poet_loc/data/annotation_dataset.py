@@ -33,7 +33,8 @@ class AnnotationDataset:
         except FileNotFoundError:
             raise InputError("no such file", path=path) from None
         except (ValueError, KeyError, TypeError) as error:
-            raise InputError(f"not an annotation file ({error!r})", path=path) from None
+            what = f"{error} is missing" if isinstance(error, KeyError) else str(error)
+            raise InputError(f"not an annotation file ({what})", path=path) from None
         self._path, self._folder = path, Path(images)
 
     @classmethod
@@ -71,7 +72,8 @@ class AnnotationDataset:
             )
         except (KeyError, ValueError, TypeError) as error:
             name = image.get("file_name", index) if isinstance(image, dict) else index
-            raise InputError(f"image {name}: {error!r}", path=self._path) from None
+            what = f"{error} is missing" if isinstance(error, KeyError) else str(error)
+            raise InputError(f"image {name}: {what}", path=self._path) from None
 
 
 def _intrinsics(numbers: Any) -> tuple[float, float, float, float]:

@@ -16,6 +16,8 @@ from poet_loc.model.checkpoint import ModelConfig, save_model
 from poet_loc.model.poet import PoET
 from poet_loc.train.options import TrainOptions
 
+NOTHING_TO_GO_ON_WITH = {"options.json", "log.jsonl", "tensorboard", "last.pt.part"}
+"""What a run leaves that failed before it was first saved; the next one may begin there."""
 MAY_CHANGE = ("out", "resume", "max_steps", "save_every", "device")
 
 
@@ -38,9 +40,11 @@ def plain(options: Any) -> Any:
 
 def begin(options: TrainOptions, config: ModelConfig, anew: list[str]) -> None:
     """Make the run's folder and write what was asked.  Raises InputError for a folder that already has a run."""
-    if options.out.exists() and any(options.out.iterdir()):
+    there = {path.name for path in options.out.iterdir()} if options.out.is_dir() else set()
+    if there - NOTHING_TO_GO_ON_WITH:
         raise InputError("already holds a run", path=options.out, fix="give --resume, or another folder")
     options.out.mkdir(parents=True, exist_ok=True)
+    (options.out / "log.jsonl").unlink(missing_ok=True)
     about = {
         "options": plain(options),
         "model": config.to_json(),

@@ -109,6 +109,15 @@ def test_a_batch_that_nothing_fills_leaves_no_run_behind(tmp_path: Path) -> None
     with pytest.raises(InputError, match="6 images do not fill one batch of 7"):
         train(replace(options, recipe=replace(options.recipe, batch=7)))
     assert not options.out.exists()
+    # nor does one that fails before it was first saved stand in the way of the next
+    image = tmp_path / "train/000001/rgb/000002.png"
+    content = image.read_bytes()
+    image.write_bytes(b"nothing")
+    with pytest.raises(InputError, match="not a readable image"):
+        train(options)
+    image.write_bytes(content)
+    train(options)
+    assert [row["step"] for row in rows(options.out)] == [1, 2, 3, 4, 5, 6]
 
 
 def test_the_run_tells_which_network_it_trained(tmp_path: Path) -> None:
