@@ -26,7 +26,7 @@ from fusion.graph_variables import block_diagonal, keyframe_variables
 from fusion.graph_walk import Keyframe, Walk
 from fusion.measurements import OBJECT_POSE, ODOMETRY_STEP
 from fusion.nav_state import CORE
-from fusion.options import FuseOptions, Graph
+from fusion.options import FuseOptions
 from fusion.place_watch import RELEASED
 from fusion.prepare import Problem
 from fusion.result import FuseResult
@@ -35,6 +35,7 @@ Array = NDArray[np.float64]
 
 _SETTLED = 1e-3  # half a squared step in units of 1-sigma, all variables together
 _HALVINGS = 6
+_APPROACH = 2  # steps from the filter's states to about where object biases will be taken to act
 
 
 @dataclass
@@ -75,10 +76,11 @@ def run_batch(problem: Problem, options: FuseOptions) -> FuseResult:
     chain = MotionChain.of(problem, options)
     builder = GraphBuilder(problem.layout, stretches[0].states[0], walk.memory.bias_model, chain, options.graph)
     for stretch in stretches:
+        _solve(stretch, builder, walk, _APPROACH)
         for again in range(max(1, options.graph.rounds)):
             if again and not _decide(stretch, builder, walk):
                 break
-            _solve(stretch, builder, walk, options.graph)
+            _solve(stretch, builder, walk, options.graph.max_iterations)
         _write_rows(stretch, walk, chain.with_imu)
     _write_statics(stretches[-1], builder, walk.memory)
     result = result_from_rows(
@@ -105,9 +107,9 @@ def _stretches(walk: Walk) -> Iterator[Stretch]:
         yield stretch
 
 
-def _solve(stretch: Stretch, builder: GraphBuilder, walk: Walk, options: Graph) -> None:
+def _solve(stretch: Stretch, builder: GraphBuilder, walk: Walk, steps: int) -> None:
     """Build the graph of a stretch from its states, and put the optimum in their place."""
-    stretch.values, stretch.tree = optimise(*_build(stretch, builder, walk), options.max_iterations)
+    stretch.values, stretch.tree = optimise(*_build(stretch, builder, walk), steps)
     stretch.spread = [_read_state(stretch, i, builder) for i in range(len(stretch.states))]
 
 

@@ -50,6 +50,8 @@ class Detection:
     """(3,) angular velocity at its stamp, rad/s."""
     moved: bool
     """Its stamp is not the keyframe's."""
+    place: Array
+    """(3,) p_cam_obj where its object's biases act; of an object pose."""
 
 
 @dataclass(frozen=True)
@@ -171,6 +173,7 @@ def error_at(d: Detection, x: Array, layout: StateLayout) -> tuple[Array, Array]
         T_world_obj,
         float(x[TIME_OFFSET]),
         np.array([x[layout.nominal_bias(d.object, kind)] for kind in kinds]).reshape(-1, 6),
+        d.place,
         x.copy(),
         layout.as_integers(),
     )
@@ -214,6 +217,7 @@ def _compiled_error(d: Detection, keyframe: int, biases: Sequence[int], model: M
             values.atPose3(landmark).matrix() if free_object else known_object,
             values.atVector(OFFSET)[0] if layout.time_offset else known_offset,
             bias,
+            d.place,
             x,
             integers,
         )

@@ -18,13 +18,15 @@ from scipy.linalg.lapack import dtrtri
 from fusion.eskf import ACCEPTED, POSITION_ONLY, ROTATION_ONLY, clone_pose
 from fusion.graph_builder import GraphBuilder
 from fusion.graph_factors import Detection
+from fusion.graph_model import seen_at
 from fusion.graph_odometry import odometry_at
 from fusion.graph_walk import Keyframe, Walk
-from fusion.measurements import CAMERA_POSE, ODOMETRY_STEP
+from fusion.measurements import CAMERA_POSE, OBJECT_POSE, ODOMETRY_STEP
 from fusion.memory import Memory
 from fusion.options import Graph
 
 Array = NDArray[np.float64]
+_NOWHERE = np.zeros(3)
 
 
 class FixedLagSmoother:
@@ -231,15 +233,17 @@ def detection_of(builder: GraphBuilder, walk: Walk, i: int, keyframe_ns: int, x:
     """Return those rows of measurement i that passed, after a keyframe with the nominal array x."""
     c, chain, stamp = walk.columns, builder.chain, int(walk.columns.stamps[i])
     first, end = 0 if passed & ROTATION_ONLY else 3, 6 if passed & POSITION_ONLY else 3
+    k, motion = int(c.objects[i]), chain.motion(keyframe_ns, stamp, x)
     return Detection(
         int(c.kinds[i]),
-        int(c.objects[i]),
+        k,
         first,
         end - first,
         walk.rotations[i].copy(),
         c.translations[i].copy(),
         walk.covariances[i].copy(),
-        chain.motion(keyframe_ns, stamp, x),
+        motion,
         chain.rate(stamp, x),
         stamp != keyframe_ns,
+        seen_at(k, motion, x) if c.kinds[i] == OBJECT_POSE else _NOWHERE,
     )

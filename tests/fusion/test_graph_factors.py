@@ -11,7 +11,7 @@ from filter_runs import LAYOUTS, simulated
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from fusion.graph_factors import Detection, Model, bias_factor, error_at, measurement_factor, robust
-from fusion.graph_model import MOTION_SIZE, TURN, bias_step
+from fusion.graph_model import BIAS_COLUMNS, MOTION_SIZE, TURN, bias_step, seen_at
 from fusion.graph_motion import MotionChain
 from fusion.graph_rows import Between
 from fusion.graph_variables import (
@@ -27,7 +27,17 @@ from fusion.graph_variables import (
 )
 from fusion.measurements import CAMERA_POSE, OBJECT_POSE
 from fusion.memory import views
-from fusion.nav_state import GRAVITY, TIME_OFFSET, StateLayout, nominal_state, retract_state
+from fusion.nav_state import (
+    EXTRINSIC_ROTATION,
+    GRAVITY,
+    OBJECT_SIZE,
+    OBJECTS,
+    TIME_OFFSET,
+    StateLayout,
+    nominal_state,
+    pose_at,
+    retract_state,
+)
 from fusion.options import FuseOptions, Graph
 from fusion.prepare import fill_memory
 from fusion.reference_models import residual_and_jacobian
@@ -74,6 +84,7 @@ def random_detection(rng, kind, moved, rows=(0, 6)):
         motion,
         rng.normal(size=3),
         moved,
+        np.array([0.1, -0.1, 1.5]),
     )
 
 
@@ -127,12 +138,45 @@ def test_a_measurement_at_a_keyframe_says_what_the_filter_says(kind):
     layout, rng = LAYOUTS["everything"], np.random.default_rng(3)
     x, d = random_state(rng, layout), random_detection(rng, kind, False)
     R_m = d.rotation.reshape(3, 3)
+    unbiased = x.copy()
+    unbiased[layout.nominal_bias(0, 0).start : layout.nominal_bias(layout.n_objects - 1, 1).stop] = 0.0
+    away, _ = residual_and_jacobian(kind, d.object, R_m, d.translation, unbiased, d.rate, 0.0, layout)
+    d = replace(d, place=d.translation - away[3:])  # there the biases of filter and graph are the same
     residual, _ = residual_and_jacobian(kind, d.object, R_m, d.translation, x, d.rate, 0.0, layout)
     np.testing.assert_allclose(error_at(d, x, layout)[0], -residual, atol=1e-12)
     biases = [object_bias_key(i) for i in range(layout.bias_kinds if kind == OBJECT_POSE else 0)]
     factor = measurement_factor(d, 0, biases, Model(layout, x.copy(), True, QUIET))
     nis = residual @ np.linalg.solve(d.covariance, residual)
     assert factor.error(values_of(variables_of(layout, biases), x)) == pytest.approx(0.5 * nis, rel=1e-9)
+
+
+def test_biases_act_where_the_object_was_seen_whatever_becomes_of_it():
+    """That place is the object in the camera after the motion, and no later step of pose or object changes it."""
+    layout, rng = LAYOUTS["everything"], np.random.default_rng(10)
+    x, d = random_state(rng, layout), random_detection(rng, OBJECT_POSE, True)
+    x[TIME_OFFSET] = 0.0
+    at = OBJECTS + OBJECT_SIZE * d.object
+    seconds, turn, shift = d.motion[0], d.motion[TURN : TURN + 9].reshape(3, 3), d.motion[TURN + 9 : TURN + 12]
+    T_world_imu, T_imu_cam, T_world_obj = pose_at(x, 0), pose_at(x, EXTRINSIC_ROTATION), pose_at(x, at)
+    fall = seconds * x[12:15] + 0.5 * seconds**2 * x[GRAVITY : GRAVITY + 3]
+    p_wi = T_world_imu.translation + fall + T_world_imu.rotation.apply(shift)
+    moved = RigidTransform.from_components(p_wi, T_world_imu.rotation * Rotation.from_matrix(turn))
+    place = ((moved * T_imu_cam).inv() * T_world_obj).translation
+    np.testing.assert_allclose(seen_at(d.object, d.motion, x), place, atol=1e-12)
+
+    d = replace(d, place=place)
+    biased, stretched = error_at(d, x, layout)
+    near = retract_state(x, 0.01 * rng.normal(size=layout.n_error), layout)
+    columns = slice(BIAS_COLUMNS + 3, BIAS_COLUMNS + 6)
+    np.testing.assert_array_equal(error_at(d, near, layout)[1][3:, columns], stretched[3:, columns])
+    bias = sum(x[layout.nominal_bias(d.object, kind)][3:] for kind in range(layout.bias_kinds))
+    for kind in range(layout.bias_kinds):
+        x[layout.nominal_bias(d.object, kind)] = 0.0
+    shift = biased[3:] - error_at(d, x, layout)[0][3:]
+    px, py, pz = place
+    D = np.array([[pz, 0.0, px], [0.0, pz, py], [-px, -py, pz]])
+    np.testing.assert_allclose(shift, D @ bias, atol=1e-12)
+    np.testing.assert_allclose(stretched[3:, columns], D, atol=1e-12)
 
 
 def test_a_camera_pose_prior_weighs_like_the_measurement_it_stands_for():
