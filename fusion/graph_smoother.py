@@ -22,7 +22,7 @@ from fusion.graph_model import seen_at
 from fusion.graph_odometry import odometry_at
 from fusion.graph_walk import Keyframe, Walk
 from fusion.measurements import CAMERA_POSE, OBJECT_POSE, ODOMETRY_STEP
-from fusion.memory import Memory
+from fusion.memory import CLONED, Memory
 from fusion.options import Graph
 
 Array = NDArray[np.float64]
@@ -70,6 +70,8 @@ class FixedLagSmoother:
         m = walk.memory
         self.builder.start(keyframe.stamp_ns, m.x, m.P, m.known)
         self.builder.add_odometry(odometry_at(walk, keyframe))
+        if self.builder.clone < 0:
+            m.counters[CLONED] = 0  # a pose that this graph does not have
         self._update()
 
     def extend(self, keyframe: Keyframe, walk: Walk) -> None:
