@@ -210,10 +210,10 @@ class GraphBuilder:
         self.clone = self.keyframe
         self.origin[self._clone_variable().place] = self.origin[:OBJECT_SIZE]
 
-    def add_linearised(self, columns: LoopColumns, which: range) -> None:
+    def add_linearised(self, columns: LoopColumns, rotations: Array, covariances: Array, which: range) -> None:
         """Add measurements that passed the gate to the newest keyframe, linearised where its variables start.
 
-        columns: rotations and covariances as the filter used them.
+        rotations and covariances are those that the filter used.
         """
         every, model = slice(which.start, which.stop), self.model
         passed, kinds = columns.decisions[every] & ACCEPTED, columns.kinds[every]
@@ -223,7 +223,10 @@ class GraphBuilder:
         own, counts, shared, count = linearise(
             which.start,
             passed,
-            *columns[2:8],
+            *columns[2:5],
+            rotations,
+            columns.translations,
+            covariances,
             self.stamp_ns,
             self.chain.stamps_ns,
             self.chain.values,

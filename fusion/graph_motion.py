@@ -93,8 +93,8 @@ class MotionChain:
         summed = gtsam.PreintegratedCombinedMeasurements(
             self._parameters(gaps / ((end - start) * 1e-9), row, gravity), bias
         )
-        for step in steps[:count]:
-            summed.integrateMeasurement(step[4:7], step[1:4], step[0])
+        for seconds, rate, force in zip(steps[:count, 0].tolist(), steps[:, 1:4], steps[:, 4:7], strict=False):
+            summed.integrateMeasurement(force, rate, seconds)
         return summed
 
     def _parameters(self, gap_s: float, row: Array, gravity: Array) -> gtsam.PreintegrationCombinedParams:

@@ -127,9 +127,11 @@ class FixedLagSmoother:
         for key in self._lasting:
             groups.insert2(key, newest - oldest + 1)
         for keyframe, keys in self._came.items():
+            if keyframe < oldest:  # in the first group, as those at the oldest are
+                continue
             for key in keys:
-                groups.insert2(key, max(0, keyframe - oldest))
-            certain += len(keys) if keyframe >= oldest else 0
+                groups.insert2(key, keyframe - oldest)
+            certain += len(keys)
         for key in again:
             if not values.exists(key):
                 old.push_back(key)
@@ -163,7 +165,7 @@ class FixedLagSmoother:
             part, first = slice(first, first + variable.size), first + variable.size
             builder.x[variable.place] = m.x[variable.place] = variable.moved(builder.origin, step[part])
             rows.append(variable.rows_to_filter(builder.x, root[part]))
-        at = [i for variable in variables for i in variable.errors]
+        at = np.array([i for variable in variables for i in variable.errors])
         J_root = np.concatenate(rows)
         P, begun = J_root @ J_root.T, [c for c in builder.chains.values() if c.begun]
         for n, chain in enumerate(begun):  # they are the last of the newest
@@ -175,7 +177,7 @@ class FixedLagSmoother:
             P[first : first + 6] *= phi[:, None]
             P[:, first : first + 6] *= phi
             P[range(first, first + 6), range(first, first + 6)] += sigma**2
-        m.P[np.ix_(at, at)] = 0.5 * (P + P.T)
+        m.P[at[:, None], at] = 0.5 * (P + P.T)
         if builder.clone == builder.keyframe:
             clone_pose(m.x, m.P, m.layout)
 
@@ -219,7 +221,7 @@ def add_measurements(builder: GraphBuilder, walk: Walk, which: range) -> None:
     whole = c.stamps[which[0]] == builder.stamp_ns and not (layout.extrinsics or layout.time_offset)
     native = whole and CAMERA_POSE in c.kinds[which.start : which.stop]  # gtsam has a factor for it
     if builder.fixed and not native:
-        builder.add_linearised(walk.fitted, which)
+        builder.add_linearised(c, walk.rotations, walk.covariances, which)
     else:
         builder.add_detections(detections(builder, walk, which))
 

@@ -12,7 +12,7 @@ from fusion import memory
 from fusion.compiled import njit
 from fusion.eskf import fit_symmetry
 from fusion.filter_loop import advance, angular_velocity_at, begin, emit, measure
-from fusion.fuse import LoopColumns, loop_columns
+from fusion.fuse import loop_columns
 from fusion.measurements import OBJECT_POSE, ODOMETRY_STEP, camera_in_world
 from fusion.memory import MODE, NOW, REPLACED, RESTARTS, TRACKING, Memory, Work, views, work_views
 from fusion.nav_state import AT_BIASES, N_BIAS_KINDS, N_OBJECTS, OBJECT_SIZE, OBJECTS, TIME_OFFSET, Array, Ints
@@ -215,11 +215,6 @@ class Walk:
         """What was written so far: stamps, core, sigmas, covariances."""
         n, c = self.cursor[ROWS], self.columns
         return c.out_stamps[:n], c.out_core[:n], c.out_sigma[:n], c.out_covariance[:n].reshape(-1, 6, 6)
-
-    @property
-    def fitted(self) -> LoopColumns:
-        """The columns, each measurement's rotation and covariance as the filter used them."""
-        return self.columns._replace(rotations=self.rotations, covariances=self.covariances)
 
     def keyframes(self) -> Iterator[Keyframe]:
         """Yield the keyframes of the whole log, the last one at its end."""
