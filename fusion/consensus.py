@@ -4,6 +4,10 @@ Every detection of a known landmark votes for a pose of the imu. While the filte
 a level attitude of unknown heading, position and velocity), each vote says how the integrated motion must be turned
 and shifted to become the true one. Votes of one truth agree on that correction although the camera moves; gross
 errors scatter. A correction that would tilt the measured gravity is refused before it may vote.
+
+Positions are far better than rotations, and a flipped object still shows where it is: a correction is supported by
+votes that agree with it whole, and by those whose object is where the map says under it. Symmetric objects vote for
+every pose that their symmetry allows, and the heading that one of them leaves open follows from another object.
 """
 
 from __future__ import annotations
@@ -13,9 +17,16 @@ import math
 from fusion.compiled import njit
 from fusion.nav_state import Array, Ints
 from fusion.so3_kernels import apply, exp_so3, log_so3, multiply, multiply_transposed_left, multiply_transposed_right
-
-# A vote: where the detection puts the imu, where the integrated motion had it, and how far away the object is.
-VOTE_ROTATION, VOTE_POSITION, MOTION_ROTATION, MOTION_POSITION, VOTE_DISTANCE, VOTE_SIZE = 0, 9, 12, 21, 24, 25
+from fusion.votes import (
+    VOTE_ARM,
+    VOTE_DISTANCE,
+    VOTE_OBJECT,
+    VOTE_ORDER,
+    VOTE_PLACE,
+    fit_vote,
+    turn_of_pair,
+    turn_of_vote,
+)
 
 # Places in the options of the start.
 (
@@ -32,7 +43,12 @@ VOTE_ROTATION, VOTE_POSITION, MOTION_ROTATION, MOTION_POSITION, VOTE_DISTANCE, V
     LOST_SHARE,
     LOST_MIN_VOTES,
     MIN_SHARE,
-) = range(13)
+    MIN_OBJECTS,
+    MIN_PLACES,
+    LEAD,
+) = range(16)
+
+AT_ITS_PLACE, WHOLE = 1, 2  # what of a vote agrees
 
 
 @njit(cache=True)
@@ -52,12 +68,16 @@ def _shift(votes: Array, i: int, C: Array, origin: Array, gravity: Array, since:
 
 
 @njit(cache=True)
-def _correction(votes: Array, i: int, origin: Array, gravity: Array, since: float, C: Array, d: Array) -> None:
-    """Write the correction that vote i asks for: p_true = C (p_integrated - origin) + d."""
-    multiply_transposed_right(votes[i, 0:9], votes[i, 12:21], C)
+def _offset(
+    votes: Array, i: int, C: Array, origin: Array, gravity: Array, since: float, d: Array, scratch: Array
+) -> None:
+    """Write the d of a correction p_true = C (p_integrated - o) + d that puts the object of vote i at its place."""
+    turned, arm = scratch[0:9], scratch[9:12]
+    multiply(C, votes[i, 12:21], turned)
+    apply(turned, votes[i, VOTE_ARM], votes[i, VOTE_ARM + 1], votes[i, VOTE_ARM + 2], arm)
     _shift(votes, i, C, origin, gravity, since, d)
     for j in range(3):
-        d[j] = votes[i, 9 + j] - d[j]
+        d[j] = votes[i, VOTE_PLACE + j] - arm[j] - d[j]
 
 
 @njit(cache=True)
@@ -83,20 +103,31 @@ def _agree(
     cosine: float,
     distance: float,
     scratch: Array,
-) -> bool:
-    """Tell whether vote i lies within an angle and a distance of the correction (C, d + v * since)."""
-    turned, shift = scratch[0:9], scratch[9:12]
+) -> tuple[int, float]:
+    """Tell what of vote i lies within an angle and a distance of the correction (C, d + v * since), and how well.
+
+    Bits: AT_ITS_PLACE, the object is where the map says; WHOLE, the pose of the imu is the one voted for. Each supports
+    the correction by one less its squared share of what is allowed. Source: P. Torr and A. Zisserman, "MLESAC", CVIU 78
+    (2000), the score of MSAC.
+    """
+    turned, shift, fitted = scratch[0:9], scratch[9:12], scratch[12:24]
     multiply(C, votes[i, 12:21], turned)
-    trace = 0.0
-    for j in range(9):
-        trace += turned[j] * votes[i, j]
-    if 0.5 * (trace - 1.0) < cosine:
-        return False
     _shift(votes, i, C, origin, gravity, since, shift)
-    total = 0.0
+    arm, agrees, support, total = scratch[24:27], 0, 0.0, 0.0
+    apply(turned, votes[i, VOTE_ARM], votes[i, VOTE_ARM + 1], votes[i, VOTE_ARM + 2], arm)
     for j in range(3):
-        total += (votes[i, 9 + j] - shift[j] - d[j] - v[j] * since) ** 2
-    return total <= distance * distance
+        shift[j] += d[j] + v[j] * since
+        total += (votes[i, VOTE_PLACE + j] - arm[j] - shift[j]) ** 2
+    if total <= distance * distance and votes[i, VOTE_OBJECT] >= 0.0:
+        agrees, support = AT_ITS_PLACE, 1.0 - total / distance**2
+    fit_vote(votes[i], turned, fitted, scratch[27:48])
+    trace, total = 0.0, 0.0
+    for j in range(9):
+        trace += turned[j] * fitted[j]
+    for j in range(3):
+        total += (fitted[9 + j] - shift[j]) ** 2
+    off = max((1.5 - 0.5 * trace) / (1.0 - cosine), total / distance**2)
+    return (agrees + WHOLE, support + 1.0 - off) if off <= 1.0 else (agrees, support)
 
 
 @njit(cache=True)
@@ -113,38 +144,180 @@ def largest_agreement(
     C: Array,
     d: Array,
     v: Array,
+    by_places: bool,
     inlier: Ints,
     scratch: Array,
-) -> tuple[int, float]:
-    """Find the correction most votes agree on; write it to C (9,), d (3,), v (3,); return how many and their span (s).
+) -> tuple[int, float, int]:
+    """Find the correction most votes agree on; write it to C (9,), d (3,), v (3,).
+
+    by_places: votes agree if their object is at its place, however it seems turned; then gravity must be felt.
+
+    Returns how many votes agree and their span (s), and how many objects are at their places: in half of their votes,
+    and in half as many as a start needs.
 
     votes is a ring whose entries first..head-1 (modulo its length, a power of two) count; inlier (ring length) marks
     those that agree. origin (6,) is the position and velocity that the correction replaces; v is fitted to the agreeing
-    votes, so that at stamp `now` position and velocity become d and v. scratch holds 96 floats.
+    votes, so that at stamp `now` position and velocity become d and v. scratch holds 224 floats.
     """
-    mask, best, best_i, cosine = len(stamps) - 1, 0, -1, math.cos(options[MAX_ANGLE])
+    mask, cosine = len(stamps) - 1, math.cos(options[MAX_ANGLE])
+    seed = _search(
+        votes, stamps, first, head, now, up, origin, gravity, options, C, d, v, 0.0, False, by_places, inlier, scratch
+    )
+    if seed < 0:
+        return 0, 0.0, 0
     for j in range(3):
         v[j] = 0.0
-    for a in range(first, head):
-        i = a & mask
-        _correction(votes, i, origin, gravity, (stamps[i] - now) * 1e-9, C, d)
-        if _tilt(C, up) > options[MAX_TILT]:
-            continue
-        count = _mark(votes, stamps, first, head, now, origin, gravity, options, cosine, i, C, d, v, inlier, scratch)
-        if count > best:
-            best, best_i = count, i
-    if best_i < 0:
-        return 0, 0.0
-    _correction(votes, best_i, origin, gravity, (stamps[best_i] - now) * 1e-9, C, d)
-    _mark(votes, stamps, first, head, now, origin, gravity, options, cosine, best_i, C, d, v, inlier, scratch)
+    what = AT_ITS_PLACE if by_places else WHOLE
+    _mark(votes, stamps, first, head, now, origin, gravity, options, seed, C, d, v, -1.0, what, inlier, scratch)
     for _ in range(3):
-        _refine(votes, stamps, first, head, now, origin, gravity, options, cosine, C, d, v, inlier, scratch)
-    count, oldest, newest = 0, now, stamps[best_i]
+        _refine(votes, stamps, first, head, now, up, origin, gravity, options, C, d, v, what, inlier, scratch)
+    count, objects, oldest, newest = 0, 0, now, stamps[seed]
+    at_place, seen = scratch[160:192], scratch[192:224]
+    for k in range(32):
+        at_place[k] = seen[k] = 0.0
     for a in range(first, head):
         j = a & mask
+        reach = options[MAX_DISTANCE] + options[MAX_LEVER] * votes[j, VOTE_DISTANCE]
+        agrees, _ = _agree(votes, j, C, d, v, origin, gravity, (stamps[j] - now) * 1e-9, cosine, reach, scratch)
+        k = int(votes[j, VOTE_OBJECT])
+        if k >= 0:
+            seen[k & 31] += 1.0
+            at_place[k & 31] += agrees & AT_ITS_PLACE
         if inlier[j]:
             count, oldest, newest = count + 1, min(oldest, stamps[j]), max(newest, stamps[j])
-    return count, max(0.0, (newest - oldest) * 1e-9)
+    for k in range(32):
+        objects += at_place[k] >= 0.5 * max(options[MIN_VOTES], seen[k])
+    return count, max(0.0, (newest - oldest) * 1e-9), objects
+
+
+@njit(cache=True)
+def objects_seen(votes: Array, first: int, head: int) -> int:
+    """Return how many objects cast the votes first..head-1."""
+    seen, count = 0, 0
+    for a in range(first, head):
+        k = int(votes[a & (len(votes) - 1), VOTE_OBJECT])
+        seen |= 1 << (k & 31) if k >= 0 else 0
+    while seen > 0:
+        count += seen & 1
+        seen >>= 1
+    return count
+
+
+@njit(cache=True)
+def has_rival(
+    votes: Array,
+    stamps: Ints,
+    first: int,
+    head: int,
+    now: int,
+    up: Array,
+    origin: Array,
+    gravity: Array,
+    options: Array,
+    C: Array,
+    d: Array,
+    v: Array,
+    inlier: Ints,
+    scratch: Array,
+) -> bool:
+    """Tell whether quite another correction than the one that `largest_agreement` found is nearly as well supported."""
+    other = scratch[117:132]
+    for j in range(9):
+        other[j] = C[j]
+    for j in range(3):
+        other[9 + j], other[12 + j] = d[j], v[j]
+    least, C2, d2, v2 = scratch[147] / options[LEAD], scratch[132:141], scratch[141:144], scratch[144:147]
+    found = _search(
+        votes, stamps, first, head, now, up, origin, gravity, options, C2, d2, v2, least, True, False, inlier, scratch
+    )
+    return found >= 0
+
+
+@njit(cache=True)
+def _search(
+    votes: Array,
+    stamps: Ints,
+    first: int,
+    head: int,
+    now: int,
+    up: Array,
+    origin: Array,
+    gravity: Array,
+    options: Array,
+    C: Array,
+    d: Array,
+    still: Array,
+    least: float,
+    elsewhere: bool,
+    pairs: bool,
+    inlier: Ints,
+    scratch: Array,
+) -> int:
+    """Write the best supported correction of all that votes ask for to C and d; return the vote that asked, -1: none.
+
+    Its support must exceed `least`; elsewhere: it must be quite another than that in scratch[117:132], else its support
+    is left in scratch[147]. pairs: any two objects may ask for one, not only where one is a can that stands.
+    """
+    mask, best, seed, newest = len(stamps) - 1, least, -1, stamps[(head - 1) & (len(stamps) - 1)]
+    C1, d1 = scratch[48:57], scratch[57:60]
+    for j in range(3):
+        still[j] = 0.0
+    for a in range(first, head):
+        i = a & mask
+        order, since = int(votes[i, VOTE_ORDER]), (stamps[i] - now) * 1e-9
+        turns = max(order, 1)
+        others = head - first if (order == 0 or pairs) and stamps[i] == newest else 0
+        for b in range(turns + others):
+            if b < turns:
+                asked = turn_of_vote(votes[i], b, up, C1, scratch)
+            else:
+                k = (first + b - turns) & mask
+                asked = stamps[k] == newest and votes[k, VOTE_OBJECT] != votes[i, VOTE_OBJECT]
+                asked = asked and votes[k, VOTE_OBJECT] >= 0.0 and turn_of_pair(votes[i], votes[k], up, C1, scratch)
+            if not asked or _tilt(C1, up) > options[MAX_TILT]:
+                continue
+            _offset(votes, i, C1, origin, gravity, since, d1, scratch)
+            if elsewhere and not _is_another(votes[i, VOTE_DISTANCE], C1, d1, since, options, scratch):
+                continue
+            support = _mark(
+                votes,
+                stamps,
+                first,
+                head,
+                now,
+                origin,
+                gravity,
+                options,
+                i,
+                C1,
+                d1,
+                still,
+                best,
+                0,
+                inlier,
+                scratch,
+            )
+            if support > best:
+                best, seed = support, i
+                for j in range(9):
+                    C[j] = C1[j]
+                for j in range(3):
+                    d[j] = d1[j]
+    if not elsewhere:
+        scratch[147] = best
+    return seed
+
+
+@njit(cache=True)
+def _is_another(distance: float, C: Array, d: Array, since: float, options: Array, scratch: Array) -> bool:
+    """Tell whether a correction is further from that in scratch[117:132] than poor votes for the same one may be."""
+    trace, gap = 0.0, 0.0
+    for j in range(9):
+        trace += C[j] * scratch[117 + j]
+    for j in range(3):
+        gap += (d[j] - scratch[126 + j] - since * scratch[129 + j]) ** 2
+    reach = 4.0 * (options[MAX_DISTANCE] + options[MAX_LEVER] * distance)
+    return 0.5 * (trace - 1.0) < math.cos(min(3.0 * options[MAX_ANGLE], math.pi)) or gap > reach * reach
 
 
 @njit(cache=True)
@@ -157,24 +330,32 @@ def _mark(
     origin: Array,
     gravity: Array,
     options: Array,
-    cosine: float,
     seed: int,
     C: Array,
     d: Array,
     v: Array,
+    least: float,
+    what: int,
     inlier: Ints,
     scratch: Array,
-) -> int:
-    """Mark and count the votes that agree with the correction of one of them, which knows no velocity yet."""
-    count = 0
+) -> float:
+    """Return how much votes support the correction of one of them, which knows no velocity yet (seed -1: it does).
+
+    Stops where the sum cannot exceed `least` any more; what: mark the votes of which so much agrees (0: none).
+    """
+    support, cosine = 0.0, math.cos(options[MAX_ANGLE])
     for b in range(first, head):
+        if what == 0 and support + 2.0 * (head - b) <= least:
+            return support
         j = b & (len(stamps) - 1)
         reach = options[MAX_DISTANCE] + options[MAX_LEVER] * votes[j, VOTE_DISTANCE]
-        reach += options[MAX_SPEED] * abs(stamps[seed] - stamps[j]) * 1e-9
-        agrees = _agree(votes, j, C, d, v, origin, gravity, (stamps[j] - now) * 1e-9, cosine, reach, scratch)
-        inlier[j] = agrees
-        count += agrees
-    return count
+        if seed >= 0:
+            reach += options[MAX_SPEED] * abs(stamps[seed] - stamps[j]) * 1e-9
+        agrees, well = _agree(votes, j, C, d, v, origin, gravity, (stamps[j] - now) * 1e-9, cosine, reach, scratch)
+        support += well
+        if what > 0:
+            inlier[j] = agrees & what != 0
+    return support
 
 
 @njit(cache=True)
@@ -184,36 +365,46 @@ def _refine(
     first: int,
     head: int,
     now: int,
+    up: Array,
     origin: Array,
     gravity: Array,
     options: Array,
-    cosine: float,
     C: Array,
     d: Array,
     v: Array,
+    what: int,
     inlier: Ints,
     scratch: Array,
 ) -> None:
     """Average the agreeing votes' corrections, fit offset and velocity to them, and choose them anew."""
-    mask = len(stamps) - 1
+    mask, cosine = len(stamps) - 1, math.cos(options[MAX_ANGLE])
     vector, mean, turn, shift, other = scratch[48:51], scratch[51:54], scratch[54:63], scratch[63:66], scratch[66:75]
-    count = 0
+    turned, fitted, count, telling = scratch[75:84], scratch[84:96], 0, 0
     mean[0] = mean[1] = mean[2] = 0.0
     for a in range(first, head):
         i = a & mask
         if inlier[i]:
-            multiply_transposed_right(votes[i, 0:9], votes[i, 12:21], other)
+            multiply(C, votes[i, 12:21], turned)
+            fit_vote(votes[i], turned, fitted, scratch)
+            multiply_transposed_right(fitted, votes[i, 12:21], other)
             multiply_transposed_left(C, other, turn)
             log_so3(turn, vector)
             count += 1
+            telling += votes[i, VOTE_ORDER] > 0.0
             for j in range(3):
                 mean[j] += vector[j]
     if count == 0:
         return
-    exp_so3(mean[0] / count, mean[1] / count, mean[2] / count, turn)
-    multiply(C, turn, other)
-    for j in range(9):
-        C[j] = other[j]
+    by_places = what == AT_ITS_PLACE
+    if by_places:
+        _level(C, up, scratch[48:96])
+    else:
+        exp_so3(mean[0] / count, mean[1] / count, mean[2] / count, turn)
+        multiply(C, turn, other)
+        for j in range(9):
+            C[j] = other[j]
+    if by_places or (telling < options[MIN_VOTES] and up[0] ** 2 + up[1] ** 2 + up[2] ** 2 > 0.0):
+        _turn_to_places(votes, stamps, first, head, now, origin, gravity, C, v, inlier, scratch)
     # Offset and missing velocity: ridge regression, a velocity counts as MAX_SPEED, a vote as a third of MAX_DISTANCE.
     ridge = (options[MAX_DISTANCE] / 3.0 / options[MAX_SPEED]) ** 2
     for j in range(3):
@@ -223,7 +414,12 @@ def _refine(
             if inlier[i]:
                 t = (stamps[i] - now) * 1e-9
                 _shift(votes, i, C, origin, gravity, t, shift)
-                y = votes[i, 9 + j] - shift[j]
+                multiply(C, votes[i, 12:21], turned)
+                fit_vote(votes[i], turned, fitted, scratch)
+                y = fitted[9 + j] - shift[j]
+                if by_places:
+                    apply(turned, votes[i, VOTE_ARM], votes[i, VOTE_ARM + 1], votes[i, VOTE_ARM + 2], vector)
+                    y = votes[i, VOTE_PLACE + j] - vector[j] - shift[j]
                 sw, st, stt, sy, sty = sw + 1.0, st + t, stt + t * t, sy + y, sty + t * y
         determinant = sw * stt - st * st
         d[j] = (stt * sy - st * sty) / determinant
@@ -231,4 +427,60 @@ def _refine(
     for a in range(first, head):
         i = a & mask
         reach = options[MAX_DISTANCE] + options[MAX_LEVER] * votes[i, VOTE_DISTANCE]
-        inlier[i] = _agree(votes, i, C, d, v, origin, gravity, (stamps[i] - now) * 1e-9, cosine, reach, scratch)
+        agrees, _ = _agree(votes, i, C, d, v, origin, gravity, (stamps[i] - now) * 1e-9, cosine, reach, scratch)
+        inlier[i] = agrees & what != 0
+
+
+@njit(cache=True)
+def _level(C: Array, up: Array, scratch: Array) -> None:
+    """Turn a correction, by as little as it takes, so that up becomes z."""
+    u, turn, turned = scratch[0:3], scratch[3:12], scratch[12:21]
+    apply(C, up[0], up[1], up[2], u)
+    sine = math.sqrt(u[0] ** 2 + u[1] ** 2)
+    angle = math.atan2(sine, u[2]) / sine if sine > 0.0 else 0.0
+    exp_so3(angle * u[1], -angle * u[0], 0.0, turn)
+    multiply(turn, C, turned)
+    for j in range(9):
+        C[j] = turned[j]
+
+
+@njit(cache=True)
+def _turn_to_places(
+    votes: Array,
+    stamps: Ints,
+    first: int,
+    head: int,
+    now: int,
+    origin: Array,
+    gravity: Array,
+    C: Array,
+    v: Array,
+    inlier: Ints,
+    scratch: Array,
+) -> None:
+    """Turn a correction about the vertical to where the agreeing votes' objects fit their places best."""
+    shift, arm, turned, sums = scratch[63:66], scratch[51:54], scratch[75:84], scratch[84:96]
+    sums[:] = 0.0
+    for a in range(first, head):
+        i = a & (len(stamps) - 1)
+        if inlier[i]:
+            since = (stamps[i] - now) * 1e-9
+            _shift(votes, i, C, origin, gravity, since, shift)
+            multiply(C, votes[i, 12:21], turned)
+            apply(turned, votes[i, VOTE_ARM], votes[i, VOTE_ARM + 1], votes[i, VOTE_ARM + 2], arm)
+            x, y = shift[0] + v[0] * since + arm[0], shift[1] + v[1] * since + arm[1]
+            p, q = votes[i, VOTE_PLACE], votes[i, VOTE_PLACE + 1]
+            sums[0] += 1.0
+            sums[1] += x
+            sums[2] += y
+            sums[3] += p
+            sums[4] += q
+            sums[5] += x * p + y * q
+            sums[6] += x * q - y * p
+    n = max(sums[0], 1.0)
+    along = sums[5] - (sums[1] * sums[3] + sums[2] * sums[4]) / n
+    across = sums[6] - (sums[1] * sums[4] - sums[2] * sums[3]) / n
+    exp_so3(0.0, 0.0, math.atan2(across, along) if along > 0.0 else 0.0, turned)
+    multiply(turned, C, sums[0:9])
+    for j in range(9):
+        C[j] = sums[j]

@@ -15,12 +15,16 @@ from fusion.consensus import (
     LOST_MIN_VOTES,
     LOST_SHARE,
     LOST_WINDOW_S,
+    MAX_TILT,
+    MIN_OBJECTS,
+    MIN_PLACES,
     MIN_SHARE,
     MIN_VOTES,
     START_MIN_SPAN_S,
     START_WINDOW_S,
-    VOTE_DISTANCE,
+    has_rival,
     largest_agreement,
+    objects_seen,
 )
 from fusion.eskf import (
     ACCEPTED,
@@ -103,6 +107,7 @@ from fusion.tape import (
     note_row,
     note_step,
 )
+from fusion.votes import VOTE_ARM, VOTE_AXIS, VOTE_DISTANCE, VOTE_OBJECT, VOTE_ORDER, VOTE_PLACE
 
 # Places in the limits.
 LIMIT_BOTH, LIMIT_ROTATION, LIMIT_POSITION, PARTIAL, NOMINAL_OFFSET, ADAPTATION, MAX_SCALE, JUMP_AFTER, SETTLED = range(
@@ -552,8 +557,8 @@ def _fit_object_symmetry(m: Memory, w: Work, k: int, R_m: Array, rate: Array) ->
 
 @njit(cache=True)
 def _vote(m: Memory, w: Work, kind: int, k: int, rotation: Array, translation: Array, decision: int) -> None:
-    """Remember where a measurement puts the imu. A symmetric object does not say which way it is turned: no vote."""
-    if kind == OBJECT_POSE and (m.orders[k] != 1 or m.known[k] == 0.0 or status_of(m, kind, k) != ON_MAP):
+    """Remember where a measurement puts the imu."""
+    if kind == OBJECT_POSE and (m.known[k] == 0.0 or status_of(m, kind, k) != ON_MAP):
         return
     slot = m.counters[VOTE_HEAD] & (len(m.vote_stamps) - 1)
     vote = m.votes[slot]
@@ -577,6 +582,17 @@ def _vote(m: Memory, w: Work, kind: int, k: int, rotation: Array, translation: A
     for i in range(3):
         vote[9 + i] = p_wc[i] - lever[i]
         vote[21 + i] = m.x[POSITION + i]
+        vote[VOTE_ARM + i], vote[VOTE_PLACE + i], vote[VOTE_AXIS + i] = 0.0, vote[9 + i], 0.0
+    vote[VOTE_ORDER], vote[VOTE_OBJECT] = 1.0, -1.0
+    if kind == OBJECT_POSE:
+        axis = m.axes[k]
+        vote[VOTE_ORDER], vote[VOTE_OBJECT] = m.orders[k], k
+        apply(m.x[at : at + 9], axis[0], axis[1], axis[2], vote[VOTE_AXIS : VOTE_AXIS + 3])
+        R_ic = m.x[EXTRINSIC_ROTATION : EXTRINSIC_ROTATION + 9]
+        apply(R_ic, translation[0], translation[1], translation[2], lever)
+        for i in range(3):
+            vote[VOTE_ARM + i] = p_ic[i] + lever[i]
+            vote[VOTE_PLACE + i] = m.x[at + 9 + i]
     for i in range(9):
         vote[12 + i] = m.x[i]
     m.used[slot] = decision & POSITION_ONLY  # rotation alone does not hold the position
@@ -599,18 +615,20 @@ def _first_vote(m: Memory, window_s: float, wanted: int) -> int:
 
 
 @njit(cache=True)
-def _agreement(m: Memory, w: Work, first: int) -> tuple[int, float]:
-    """Return how many of the votes since `first` agree and their span; leave their correction in w.step[96:117].
+def _agreement(m: Memory, w: Work, first: int, by_places: bool) -> tuple[int, float, int]:
+    """Return what `largest_agreement` says of the votes since `first`; leave their correction in w.step[96:117].
 
     The integrated velocity may be right (the votes jump) or wrong (there were none for long), so both are tried.
     """
-    kept = _agreement_beside(m, w, first, 0.0)
-    replaced = _agreement_beside(m, w, first, 1.0)
-    return _agreement_beside(m, w, first, 0.0) if kept[0] >= replaced[0] else replaced
+    kept = _agreement_beside(m, w, first, 0.0, by_places)
+    replaced = _agreement_beside(m, w, first, 1.0, by_places)
+    return _agreement_beside(m, w, first, 0.0, by_places) if kept[0] >= replaced[0] else replaced
 
 
 @njit(cache=True)
-def _agreement_beside(m: Memory, w: Work, first: int, share_of_velocity: float) -> tuple[int, float]:
+def _agreement_beside(
+    m: Memory, w: Work, first: int, share_of_velocity: float, by_places: bool
+) -> tuple[int, float, int]:
     C, d, v, origin = w.step[96:105], w.step[105:108], w.step[108:111], w.step[111:117]
     for i in range(3):
         origin[i] = m.x[POSITION + i]
@@ -621,24 +639,50 @@ def _agreement_beside(m: Memory, w: Work, first: int, share_of_velocity: float) 
         first,
         m.counters[VOTE_HEAD],
         m.counters[NOW],
-        m.up,
+        _up(m, w),
         origin,
         m.x[GRAVITY : GRAVITY + 3],
         m.start,
         C,
         d,
         v,
+        by_places,
         m.inliers,
         w.step,
+    )
+
+
+@njit(cache=True, _nrt=True)
+def _up(m: Memory, w: Work) -> Array:
+    """Return where the integrated motion has up; zero where nothing feels it."""
+    up = w.step[150:153]
+    for i in range(3):
+        up[i] = m.up[i] if m.start[MAX_TILT] < math.pi else 0.0
+    return up
+
+
+@njit(cache=True)
+def _is_contested(m: Memory, w: Work, first: int) -> bool:
+    """Tell whether the agreement that was found has a rival."""
+    C, d, v, origin = w.step[96:105], w.step[105:108], w.step[108:111], w.step[111:117]
+    g, newest, up = m.x[GRAVITY : GRAVITY + 3], m.counters[VOTE_HEAD], _up(m, w)
+    return has_rival(
+        m.votes, m.vote_stamps, first, newest, m.counters[NOW], up, origin, g, m.start, C, d, v, m.inliers, w.step
     )
 
 
 @njit(cache=True)
 def _try_to_start(m: Memory, w: Work) -> None:
     first = _first_vote(m, m.start[START_WINDOW_S], 2 * int(m.start[MIN_VOTES]))
-    count, span = _agreement(m, w, first)
-    enough = max(m.start[MIN_VOTES], m.start[MIN_SHARE] * (m.counters[VOTE_HEAD] - first))
-    if count < enough or span < m.start[START_MIN_SPAN_S]:
+    count, span, _ = _agreement(m, w, first, False)
+    total = m.counters[VOTE_HEAD] - first
+    if count < max(m.start[MIN_VOTES], m.start[MIN_SHARE] * total):
+        if objects_seen(m.votes, first, m.counters[VOTE_HEAD]) < m.start[MIN_OBJECTS] or m.start[MAX_TILT] >= math.pi:
+            return
+        count, span, objects = _agreement(m, w, first, True)
+        if objects < m.start[MIN_OBJECTS] or count < max(m.start[MIN_VOTES], m.start[MIN_PLACES] * total):
+            return
+    if span < m.start[START_MIN_SPAN_S] or _is_contested(m, w, first):
         return
     _adopt(m, w, 0)
     m.counters[MODE], m.counters[STARTED_AT], m.counters[LAST_UPDATE] = TRACKING, m.counters[NOW], m.counters[NOW]
@@ -658,8 +702,8 @@ def _restart_if_lost(m: Memory, w: Work) -> None:
     if used > m.start[LOST_SHARE] * (head - first):
         return
     m.up[0], m.up[1], m.up[2] = 0.0, 0.0, 1.0
-    count, _ = _agreement(m, w, first)
-    if count >= m.start[LOST_MIN_VOTES] and count > 3.0 * used:
+    count = _agreement(m, w, first, False)[0]
+    if count >= m.start[LOST_MIN_VOTES] and count > 3.0 * used and not _is_contested(m, w, first):
         _adopt(m, w, GYRO_BIAS_ERROR)
         m.counters[RESTARTS] += 1
         m.counters[STARTED_AT] = m.counters[NOW]

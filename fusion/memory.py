@@ -9,9 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fusion.compiled import njit
-from fusion.consensus import VOTE_SIZE
 from fusion.measurements import MAX_COLUMNS
 from fusion.nav_state import CORE, LAYOUT_SIZE, StateLayout
+from fusion.votes import VOTE_SIZE
 
 Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -133,7 +133,7 @@ def allocate(layout: StateLayout) -> tuple[Array, Ints]:
         (END_OF_STATE, 0),
         (AT_NOISE, 12),
         (AT_LIMITS, 12),
-        (AT_START, 16),
+        (AT_START, 20),
         (AT_BIAS_MODEL, 14),
         (AT_MOVED, 12),
         (AT_MEETING, 8),
@@ -210,7 +210,7 @@ def views(floats: Array, integers: Ints) -> Memory:
         f[i[AT_UP] : i[AT_UP] + 3],
         f[i[AT_NOISE] : i[AT_NOISE] + 12],
         f[i[AT_LIMITS] : i[AT_LIMITS] + 12],
-        f[i[AT_START] : i[AT_START] + 16],
+        f[i[AT_START] : i[AT_START] + 20],
         f[i[AT_BIAS_MODEL] : i[AT_BIAS_MODEL] + 14],
         f[i[AT_MOVED] : i[AT_MOVED] + 12],
         f[i[AT_MEETING] : i[AT_MEETING] + 8],

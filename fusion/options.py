@@ -160,6 +160,12 @@ class Start:
     """Votes that must agree before anything is published."""
     min_share: float = 0.4
     """Share of the window's votes that must agree."""
+    min_objects: int = 3
+    """Where so many objects are where the map says from one pose, however they seem turned, their places will do,"""
+    min_places: float = 0.6
+    """if this share of the window's detections shows them there."""
+    lead: float = 1.2
+    """A pose is believed if it has so many times the support of any quite other one."""
     min_span_s: float = 0.4
     """Time that they must span, s."""
     window_s: float = 1.0

@@ -196,7 +196,7 @@ def fill_memory(problem: Problem, options: FuseOptions) -> tuple[Array, NDArray[
     )
     m.noise[imu.MEASURED] = options.imu.measured and problem.motion in WITH_IMU
     m.limits[: filter_loop.SETTLED + 1] = _limits(options)
-    m.start[: consensus.MIN_SHARE + 1] = _start(options)
+    m.start[: consensus.LEAD + 1] = _start(options)
     bias = options.bias
     m.bias_model[:] = 0.0
     m.bias_model[eskf.BIAS_ROTATION] = math.radians(bias.rotation_deg)
@@ -293,6 +293,9 @@ def _start(options: FuseOptions) -> list[float]:
         consensus.LOST_SHARE: start.lost_share,
         consensus.LOST_MIN_VOTES: start.lost_min_votes,
         consensus.MIN_SHARE: start.min_share,
+        consensus.MIN_OBJECTS: start.min_objects,
+        consensus.MIN_PLACES: start.min_places,
+        consensus.LEAD: start.lead,
     }
     return [float(values[i]) for i in range(len(values))]
 

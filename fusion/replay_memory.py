@@ -7,10 +7,10 @@ from typing import NamedTuple
 import numpy as np
 
 from fusion.compiled import njit
-from fusion.consensus import VOTE_SIZE
 from fusion.imu_noise import SAMPLE_SIZE
 from fusion.memory import END_OF_STATE, N_COUNTERS, VOTES
 from fusion.nav_state import Array, Ints
+from fusion.votes import VOTE_SIZE
 
 BATCH = 32  # measurements that one call can hand over
 

@@ -1,0 +1,147 @@
+"""Starting where single votes do not do: symmetric objects only, rotations that are wrong, poses that are ambiguous."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from filter_runs import assert_same, run
+from scipy.spatial.transform import RigidTransform, Rotation
+from test_online import assert_ends_like, estimator_for, feed, shuffled
+
+from fusion import filter_loop, reference_filter
+from fusion.fuse import fuse
+from fusion.options import DetectionBias, FuseOptions
+from fusion.prepare import pose_problem
+from fusion.simulate import SimulationOptions, simulate
+from poet_loc.core.input_error import InputError
+from poet_loc.core.records import LandmarkMap, Symmetry
+from poet_loc.io.log_folder import Log
+
+OPTIONS = FuseOptions(bias=DetectionBias(use=False))
+CAN, BOX = Symmetry((0.0, 0.0, 1.0), "continuous"), Symmetry((0.0, 0.0, 1.0), 2)
+LYING = Rotation.from_euler("X", 90.0, degrees=True)
+
+
+def table(symmetries: list[Symmetry | None], lying: bool = False, seed: int = 3, **others) -> Log:
+    """Return a log of objects with these symmetries, all standing or all lying, seen turned by any of them."""
+    wanted = {"duration_s": 6.0, "imu_rate_hz": 100.0, "camera_rate_hz": 15.0, "noise": "white", "rest_s": 0.0}
+    log = simulate(SimulationOptions(seed=seed, objects=len(symmetries), symmetric_objects=0, **(wanted | others)))
+    marks = []
+    for mark, symmetry in zip(log.landmark_map, symmetries):
+        T_world_obj = mark.T_world_obj
+        x_axis = T_world_obj.rotation.as_matrix()[:, 0]
+        heading = Rotation.from_euler("Z", np.arctan2(x_axis[1], x_axis[0]))
+        T_world_obj = RigidTransform.from_components(T_world_obj.translation, heading * LYING if lying else heading)
+        marks.append(replace(mark, symmetry=symmetry, T_world_obj=T_world_obj))
+    poses, rng = log.object_poses[""], np.random.default_rng(seed)
+    at = poses.object_ids - 1
+    turn = rng.uniform(-np.pi, np.pi, len(poses))
+    own = np.array([0.0 if each is None else np.nan if each is CAN else np.pi for each in symmetries])[at]
+    turn = np.where(np.isnan(own), turn, own * rng.integers(0, 2, len(poses)))
+    spin = Rotation.from_rotvec(turn[:, None] * [0.0, 0.0, 1.0])
+    moved = log.landmark_map.T_world_obj[at].inv() * LandmarkMap(tuple(marks)).T_world_obj[at]
+    shown = poses.T_cam_obj * moved * RigidTransform.from_rotation(spin)
+    return replace(log, landmark_map=LandmarkMap(tuple(marks)), object_poses={"": replace(poses, T_cam_obj=shown)})
+
+
+def turned(log: Log, degrees: float, share: float = 1.0, seed: int = 0) -> Log:
+    """Return the log in which each object's detections are turned by so much about an axis of its own."""
+    poses, rng = log.object_poses[""], np.random.default_rng(seed)
+    axes = rng.standard_normal((20, 3))
+    axes *= np.radians(degrees) / np.linalg.norm(axes, axis=1, keepdims=True)
+    wrong = Rotation.from_rotvec(axes[poses.object_ids] * (rng.random(len(poses)) < share)[:, None])
+    T_cam_obj = RigidTransform.from_components(poses.T_cam_obj.translation, wrong * poses.T_cam_obj.rotation)
+    return replace(log, object_poses={"": replace(poses, T_cam_obj=T_cam_obj)})
+
+
+def start_of(log: Log, options: FuseOptions = OPTIONS) -> tuple[float, float, float]:
+    """Return when the filter starts (s), and the errors of its first second: position (m) and angle (deg)."""
+    result = fuse(log, options)
+    began = int(result.stamps_ns[0])
+    truth = log.T_world_imu.between(began, began + 1_000_000_000)
+    estimate, _ = result.trajectory.interpolate(truth.stamps_ns)
+    away = np.linalg.norm(estimate.translation - truth.T_world_body.translation, axis=1)
+    off = (estimate.rotation.inv() * truth.T_world_body.rotation).magnitude()
+    return (began - int(log.imu.stamps_ns[0])) * 1e-9, float(away.mean()), float(np.degrees(off.mean()))
+
+
+@pytest.mark.parametrize(
+    ("symmetries", "lying"),
+    [
+        ([CAN, CAN], False),
+        ([CAN] * 4, False),
+        ([CAN], True),
+        ([CAN, CAN], True),
+        ([BOX] * 3, False),
+        ([CAN, BOX], False),
+    ],
+)
+def test_symmetric_objects_alone_start_the_filter(symmetries, lying):
+    when, distance, angle = start_of(table(symmetries, lying))
+    assert when < 1.5
+    assert distance < 0.1
+    assert angle < 6.0
+
+
+@pytest.mark.parametrize(("symmetries", "lying"), [([CAN], False), ([BOX], False)])
+def test_nothing_is_published_where_the_pose_is_ambiguous(symmetries, lying):
+    with pytest.raises(InputError, match="never started"):
+        fuse(table(symmetries, lying), OPTIONS)
+
+
+def test_a_box_that_lies_is_told_from_its_half_turn_by_gravity():
+    when, distance, angle = start_of(tilted(table([None])))
+    assert when < 1.5
+    assert distance < 0.1
+    assert angle < 6.0
+
+
+def tilted(log: Log) -> Log:
+    """Return the log in which the objects' z axes are level, so that a half turn about them stands on its head."""
+    turn = RigidTransform.from_rotation(Rotation.from_euler("Y", 90.0, degrees=True))
+    marks = tuple(replace(mark, T_world_obj=mark.T_world_obj * turn, symmetry=BOX) for mark in log.landmark_map)
+    poses = log.object_poses[""]
+    half = RigidTransform.from_rotation(Rotation.from_rotvec([0.0, 0.0, np.pi]))
+    shown = (poses.T_cam_obj * turn).as_matrix()
+    odd = np.random.default_rng(1).random(len(poses)) < 0.5
+    shown[odd] = shown[odd] @ half.as_matrix()
+    return replace(
+        log,
+        landmark_map=LandmarkMap(marks),
+        object_poses={"": replace(poses, T_cam_obj=RigidTransform.from_matrix(shown))},
+    )
+
+
+def test_places_start_the_filter_where_rotations_are_wrong():
+    log = turned(table([None] * 5), 25.0)
+    when, distance, angle = start_of(log)
+    assert when < 1.0
+    assert distance < 0.1
+    assert angle < 6.0
+    votes_only = replace(OPTIONS, start=replace(OPTIONS.start, min_objects=10))
+    with pytest.raises(InputError, match="never started"):
+        fuse(log, votes_only)
+
+
+def test_one_object_of_which_every_other_detection_is_flipped_starts_nothing():
+    log = table([None])
+    poses = log.object_poses[""]
+    shown = poses.T_cam_obj.as_matrix()
+    half = RigidTransform.from_rotation(Rotation.from_rotvec([0.0, 0.0, np.pi])).as_matrix()
+    shown[::2] = shown[::2] @ half
+    log = replace(log, object_poses={"": replace(poses, T_cam_obj=RigidTransform.from_matrix(shown))})
+    with pytest.raises(InputError, match="never started"):
+        fuse(log, OPTIONS)
+
+
+@pytest.mark.parametrize("log", [table([CAN, CAN, BOX]), turned(table([None] * 4), 25.0)])
+def test_compiled_is_plain_and_shuffled_is_in_order(log):
+    problem = pose_problem(log, OPTIONS)
+    compiled, plain = (run(loop, problem, OPTIONS) for loop in (filter_loop.run_log, reference_filter.run_log))
+    assert_same(compiled, plain, 1e-8)
+    estimator = estimator_for(problem, OPTIONS)
+    for event in shuffled(problem, 0.3, np.random.default_rng(0)):
+        feed(estimator, problem, event)
+    assert_ends_like(estimator, problem, OPTIONS)
