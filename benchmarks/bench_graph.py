@@ -9,8 +9,9 @@ IMU sample, make one factor per measurement (a CustomFactor on our compiled erro
 bias, insert initial values, call ISAM2 (update in our order of elimination, marginalise), ask for the newest state and
 its joint covariance. **Solver** are ISAM2's calls alone as ours makes them, on factors that are ready. **Peer** is
 gtsam's IncrementalFixedLagSmoother (QR) fed with bare's factors, ready, asked for the newest pose only. Times are CPU
-times of this process per keyframe, medians over the rounds. All but the peer must end in our last pose, or the run
-ends with an error.
+times of this process per keyframe, medians over the rounds. Solver must end in our last pose, bare within a
+millimetre of it (factors that can be called again let an object's bias act where the object was first seen, ours where
+it is predicted), or the run ends with an error.
 
 --long: the online graph, fed for so many seconds: time per keyframe and memory early and late.
 """
@@ -42,7 +43,7 @@ from fusion.options import FuseOptions
 from fusion.prepare import pose_problem, time_shift_ns
 from fusion.simulate import SimulationOptions, simulate
 
-TOLERANCE_M = 1e-6
+TOLERANCE_M, TOLERANCE_BARE_M = 1e-6, 1e-3
 
 
 Make = Callable[[], Any]
@@ -254,8 +255,9 @@ def compare(objects: int, seconds: float, rounds: int) -> None:
         times.append([spent for spent, _ in row])
         last = row[0][1].T_world_imu.translation[-1]
         ends = row[1][1].translation(), row[2][1].calculateEstimatePose3(own[-1].newest[0]).translation()
-        if max(np.linalg.norm(end - last) for end in ends) > TOLERANCE_M:
-            sys.exit(f"{objects} objects: the calls end in another pose")
+        for end, most in zip(ends, (TOLERANCE_BARE_M, TOLERANCE_M), strict=True):
+            if np.linalg.norm(end - last) > most:
+                sys.exit(f"{objects} objects: the calls end {np.linalg.norm(end - last):.1e} m from our pose")
     ours, others, alone = (statistics.median(row[i] for row in times) * 1e3 / len(own) for i in range(3))
     ratios = [statistics.median(row[a] / row[b] for row in times) for a, b in ((0, 1), (0, 2), (3, 0))]
     print(
