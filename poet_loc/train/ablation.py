@@ -106,6 +106,7 @@ def _trained(options: AblationOptions, name: str, network: NetworkOptions) -> tu
         options.steps,
         options.batch,
         learning_rate=5e-4,
+        warmup=options.steps // 10,
         seed=options.seed,
         max_steps=options.max_steps,
     )
