@@ -17,6 +17,7 @@ from fusion.filter_loop import PARTIAL
 from fusion.fuse import gate_log, never_started, result_from_rows
 from fusion.graph_builder import GraphBuilder
 from fusion.graph_factors import Detection, error_at
+from fusion.graph_gnc import Truncation, anneal
 from fusion.graph_model import BIAS_COLUMNS
 from fusion.graph_motion import MotionChain
 from fusion.graph_odometry import odometry_at, odometry_error_at
@@ -26,7 +27,7 @@ from fusion.graph_variables import block_diagonal, keyframe_variables
 from fusion.graph_walk import Keyframe, Walk
 from fusion.measurements import OBJECT_POSE, ODOMETRY_STEP
 from fusion.nav_state import CORE
-from fusion.options import FuseOptions
+from fusion.options import FuseOptions, Graph
 from fusion.place_watch import RELEASED
 from fusion.prepare import Problem
 from fusion.result import FuseResult
@@ -76,7 +77,7 @@ def run_batch(problem: Problem, options: FuseOptions) -> FuseResult:
     chain = MotionChain.of(problem, options)
     builder = GraphBuilder(problem.layout, stretches[0].states[0], walk.memory.bias_model, chain, options.graph)
     for stretch in stretches:
-        _solve(stretch, builder, walk, _APPROACH)
+        _approach(stretch, builder, walk, options.graph)
         for again in range(max(1, options.graph.rounds)):
             if again and not _decide(stretch, builder, walk):
                 break
@@ -105,6 +106,23 @@ def _stretches(walk: Walk) -> Iterator[Stretch]:
         stretch.states.append(m.x.copy())
     if stretch is not None:
         yield stretch
+
+
+def _approach(stretch: Stretch, builder: GraphBuilder, walk: Walk, options: Graph) -> None:
+    """Bring a stretch to about where its solution is, and with gnc decide from there what passes the gate."""
+    if not options.gnc:
+        _solve(stretch, builder, walk, _APPROACH)
+        return
+    plain, truncation, c = builder.model, Truncation(options.kernel_width), walk.columns
+    for keyframe in stretch.keyframes:
+        for j in (*keyframe.between, *keyframe.at):
+            if not c.decisions[j] & RELEASED and c.kinds[j] != ODOMETRY_STEP:
+                c.decisions[j] = ACCEPTED
+    builder.model = replace(plain, truncation=truncation)
+    graph, values = _build(stretch, builder, walk)
+    stretch.values, builder.model = anneal(graph, values, truncation, optimise), plain
+    stretch.spread = [_read_state(stretch, i, builder) for i in range(len(stretch.states))]
+    _decide(stretch, builder, walk)
 
 
 def _solve(stretch: Stretch, builder: GraphBuilder, walk: Walk, steps: int) -> None:

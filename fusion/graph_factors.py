@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import block_diag
 
+from fusion.graph_gnc import Truncation
 from fusion.graph_model import (
     BIAS_COLUMNS,
     EXTRINSIC_COLUMNS,
@@ -63,6 +64,12 @@ class Model:
     """A nominal array; scratch but for what is known."""
     with_imu: bool
     options: Graph
+    truncation: Truncation | None = None
+    """In the place of the kernel."""
+
+    def noise(self, covariance: Array) -> gtsam.noiseModel.Base:
+        """Return the noise of a measurement's rows."""
+        return robust(self.options, covariance) if self.truncation is None else self.truncation.noise(covariance)
 
     @cached_property
     def integers(self) -> NDArray[np.int64]:
@@ -141,7 +148,7 @@ def measurement_factor(
         return _camera_pose_prior(detection, keyframe, model)
     keys, error = _compiled_error(detection, keyframe, biases, model)
     rows = slice(detection.first, detection.first + detection.size)
-    return gtsam.CustomFactor(robust(model.options, detection.covariance[rows, rows]), keys, error)
+    return gtsam.CustomFactor(model.noise(detection.covariance[rows, rows]), keys, error)
 
 
 def _camera_pose_prior(detection: Detection, keyframe: int, model: Model) -> gtsam.NonlinearFactor:
@@ -150,7 +157,7 @@ def _camera_pose_prior(detection: Detection, keyframe: int, model: Model) -> gts
     T_imu_cam = pose3(model.x, EXTRINSIC_ROTATION)
     T_world_imu = gtsam.Pose3(gtsam.Rot3(R_m), detection.translation).compose(T_imu_cam.inverse())
     A = T_imu_cam.AdjointMap() @ block_diag(np.eye(3), R_m.T)
-    noise = robust(model.options, A @ detection.covariance @ A.T)
+    noise = model.noise(A @ detection.covariance @ A.T)
     return gtsam.PriorFactorPose3(pose_key(keyframe), T_world_imu, noise)
 
 

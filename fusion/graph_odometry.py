@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fusion.eskf import ACCEPTED, POSITION_ONLY, ROTATION_ONLY
-from fusion.graph_factors import Model, robust
+from fusion.graph_factors import Model
 from fusion.graph_variables import EXTRINSICS, pose3, pose_key
 from fusion.graph_walk import Keyframe, Walk
 from fusion.measurements import ODOMETRY_STEP
@@ -61,7 +61,7 @@ def odometry_factor(step: OdometryStep, then: int, now: int, model: Model) -> gt
                 H[i] = np.asfortranarray(J[rows, 6 * i : 6 * i + 6])
         return e[rows]
 
-    return gtsam.CustomFactor(robust(model.options, step.covariance[rows, rows]), keys, error)
+    return gtsam.CustomFactor(model.noise(step.covariance[rows, rows]), keys, error)
 
 
 def odometry_error_at(step: OdometryStep, x_then: Array, x_now: Array) -> Array:

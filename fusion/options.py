@@ -296,6 +296,9 @@ class Graph:
     """Robust kernel of the measurements that passed the gate."""
     kernel_width: float = 3.5
     """Where it begins to bend, in 1-sigma of all six rows."""
+    gnc: bool = False
+    """The batch does not begin with what passed the filter's gate, but finds by graduated non-convexity what the most
+    measurements agree on, those beyond kernel_width cut off; for logs on which the filter follows gross errors."""
     relinearize_every: int = 0
     """The fixed-lag smoother linearises anew once in so many keyframes; 0: never, each factor once, at the prediction.
 

@@ -18,10 +18,13 @@ from fusion.fuse import fuse, run_filter
 from fusion.graph import run_graph
 from fusion.graph_builder import GraphBuilder
 from fusion.graph_factors import Model
+from fusion.graph_motion import MotionChain
 from fusion.graph_odometry import OdometryStep, odometry_error_at, odometry_factor
 from fusion.graph_smoother import FixedLagSmoother
 from fusion.graph_variables import CloneVariable, errors_of, keyframe_variables, pose3, static_variables
+from fusion.graph_walk import Walk
 from fusion.measurements import ODOMETRY_STEP
+from fusion.memory import CLONED
 from fusion.nav_state import EXTRINSIC_ROTATION, StateLayout, local_state, pose_at, put_pose
 from fusion.options import DetectionBias, Estimate, FuseOptions, Graph, Odometry, Prior
 from fusion.prepare import pose_problem
@@ -227,3 +230,15 @@ def test_fed_online_it_is_the_graph_on_the_whole_log(lateness_s):
     assert feed.estimator.health().too_late == 0
     assert lateness_s == 0.0 or feed.estimator.health().replays > 10
     assert_same_state(state, whole, 1e-9)
+
+
+def test_a_graph_that_starts_without_odometry_takes_the_filters_clone_away():
+    """Else the filter would take in the next step against a pose that the graph knows nothing of."""
+    problem = pose_problem(log_with_odometry(0.017, noise="white"), GRAPH)
+    walk = Walk(problem, GRAPH)
+    keyframe, m = walk.next_keyframe(), walk.memory
+    assert keyframe.started
+    m.counters[CLONED] = 1
+    builder = GraphBuilder(problem.layout, m.x, m.bias_model, MotionChain.of(problem, GRAPH), GRAPH.graph)
+    FixedLagSmoother(builder, GRAPH.graph).start(keyframe, walk)
+    assert m.counters[CLONED] == 0

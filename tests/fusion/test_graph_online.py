@@ -130,3 +130,19 @@ def test_an_approximate_map_and_calibration_come_out_the_same():
     stamps = problem.measurements.stamps_ns
     states = Feed(problem, options).all(np.minimum(0.05e9, np.maximum(last - stamps, 0)), last)
     assert_same_state(states[last], whole, 1e-8)
+
+
+@pytest.mark.parametrize("lateness_s", [0.0, 0.6])
+def test_an_unknown_map_is_found_as_on_the_whole_log(lateness_s):
+    """Nobody says which object anchors the world: the first that is seen does, whatever the order of arrival."""
+    options = replace(OPTIONS, motion="imu", estimate=Estimate(map="unknown"))
+    problem = simulated(options=options, symmetric_objects=0, noise="white")
+    whole = run_graph(problem, options)
+    last, stamps = problem.imu.stamps_ns[-2], problem.measurements.stamps_ns
+    delays = np.random.default_rng(1).uniform(0.0, lateness_s * 1e9, len(stamps))
+    feed = Feed(problem, options)
+    states = feed.all(np.minimum(delays, np.maximum(last - stamps, 0)), last)
+    assert feed.estimator.health().too_late == 0
+    assert lateness_s == 0.0 or feed.estimator.health().replays > 50
+    assert_same_state(states[last], whole, 1e-8)
+    np.testing.assert_array_equal(feed.estimator.memory.known, 1.0)
