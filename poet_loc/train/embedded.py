@@ -45,6 +45,10 @@ EMBEDDED = NetworkOptions(
 """The network of the shipped checkpoint; each of its last six fields is a variant the published one does not have."""
 
 
+NEAREST = 0.2
+"""Share of the true depth below which a depth that is predicted directly has no sensible logarithm or projection."""
+
+
 @dataclass(frozen=True)
 class EmbeddedLossOptions:
     """What the pose losses weigh."""
@@ -121,6 +125,12 @@ def half_sines(R: Tensor, truth: Truth) -> Tensor:
     return torch.where(truth.axes.abs().sum(1) > 0, axis, whole)
 
 
+def depth_losses(ratio: Tensor) -> Tensor:
+    """Return |log| of the ratios (K,) of estimated to true depth; below NEAREST, and behind the camera, its tangent."""
+    inside = ratio.clamp(min=NEAREST)
+    return inside.log().abs() + (inside - ratio) / NEAREST
+
+
 def pose_losses(output: PoseOutput, truth: Truth, weights: EmbeddedLossOptions) -> Losses:
     """Return the losses of all decoder layers."""
     real = real_queries(output.queries)
@@ -128,10 +138,12 @@ def pose_losses(output: PoseOutput, truth: Truth, weights: EmbeddedLossOptions) 
     layers = [(1.0, output), *[(weights.earlier_layers, layer) for layer in output.auxiliary]]
     for share, layer in layers:
         t, R = layer.translation[real], layer.rotation[real]
-        shift = (t[:, :2] / t[:, 2:] - truth.t[:, :2] / truth.t[:, 2:]) * truth.scale
+        ratio = t[:, 2] / truth.t[:, 2]
+        seen_from = torch.maximum(t[:, 2], NEAREST * truth.t[:, 2])[:, None]
+        shift = (t[:, :2] / seen_from - truth.t[:, :2] / truth.t[:, 2:]) * truth.scale
         found = {
             "centre": weights.centre * share * shift.abs().sum(1).mean(),
-            "depth": weights.depth * share * (t[:, 2] / truth.t[:, 2]).log().abs().mean(),
+            "depth": weights.depth * share * depth_losses(ratio).mean(),
             "rotation": weights.rotation * share * half_sines(R, truth).mean(),
         }
         if layer.translation_uncertainty is not None and layer.rotation_uncertainty is not None:

@@ -19,6 +19,7 @@ from poet_loc.train.embedded import (
     EMBEDDED,
     TrainEmbeddedOptions,
     Truth,
+    depth_losses,
     half_sines,
     pose_errors,
     predict,
@@ -165,3 +166,14 @@ def test_the_learning_rate_rises_then_falls_to_its_share(tmp_path):
     assert max(rates) == pytest.approx(1.0)
     assert rates[100] == pytest.approx(0.01)
     assert np.all(np.diff(rates[10:]) < 0)
+
+
+def test_a_depth_behind_the_camera_still_has_a_slope():
+    """A directly predicted depth starts anywhere: its logarithm alone would be no number and stop the training."""
+    ratio = torch.tensor([-3.0, 0.0, 0.19999, 0.20001, 0.5, 1.0, 4.0], requires_grad=True)
+    losses = depth_losses(ratio)
+    losses.sum().backward()
+    np.testing.assert_allclose(losses[3:].detach(), ratio[3:].detach().log().abs(), rtol=1e-6)
+    assert float(losses[2]) == pytest.approx(float(losses[3]), abs=1e-3)  # continuous, and so is its slope
+    np.testing.assert_allclose(ratio.grad[:4], -5.0, rtol=1e-3)
+    np.testing.assert_allclose(ratio.grad[[4, 6]], [-2.0, 0.25])
