@@ -174,6 +174,6 @@ def test_a_depth_behind_the_camera_still_has_a_slope():
     losses = depth_losses(ratio)
     losses.sum().backward()
     np.testing.assert_allclose(losses[3:].detach(), ratio[3:].detach().log().abs(), rtol=1e-6)
-    assert float(losses[2]) == pytest.approx(float(losses[3]), abs=1e-3)  # continuous, and so is its slope
+    assert losses[2].item() == pytest.approx(losses[3].item(), abs=1e-3)  # continuous, and so is its slope
     np.testing.assert_allclose(ratio.grad[:4], -5.0, rtol=1e-3)
     np.testing.assert_allclose(ratio.grad[[4, 6]], [-2.0, 0.25])
