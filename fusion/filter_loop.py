@@ -1,4 +1,4 @@
-"""The filter in time: integrate up to a stamp, take in what was measured there, start, and start again.
+"""The filter in time: integrate up to a stamp, take in what was measured there.
 
 The whole-log call below and the online estimator (`fusion/online.py`) go through the same functions.
 """
@@ -11,20 +11,7 @@ import numpy as np
 
 from fusion.compiled import njit
 from fusion.consensus import (
-    LONGEST_WINDOW_S,
-    LOST_MIN_VOTES,
-    LOST_SHARE,
-    LOST_WINDOW_S,
-    MAX_TILT,
-    MIN_OBJECTS,
-    MIN_PLACES,
-    MIN_SHARE,
-    MIN_VOTES,
-    START_MIN_SPAN_S,
     START_WINDOW_S,
-    has_rival,
-    largest_agreement,
-    objects_seen,
 )
 from fusion.eskf import (
     ACCEPTED,
@@ -32,7 +19,6 @@ from fusion.eskf import (
     REJECTED,
     ROTATION_ONLY,
     adopt_object,
-    bias_sigma,
     clone_pose,
     correct,
     decay_biases,
@@ -61,19 +47,15 @@ from fusion.memory import (
     STARTED_AT,
     TRACKING,
     UP_COUNT,
-    VOTE_HEAD,
     Memory,
     Work,
     views,
     work_views,
 )
 from fusion.nav_state import (
-    AT_BIASES,
     AT_GRAVITY,
     AT_TIME_OFFSET,
-    BIASES,
     EXTRINSIC_POSITION,
-    EXTRINSIC_ROTATION,
     GRAVITY,
     GYRO_BIAS,
     GYRO_BIAS_ERROR,
@@ -84,18 +66,17 @@ from fusion.nav_state import (
     OBJECTS,
     POSITION,
     TIME_OFFSET,
-    VELOCITY,
     Array,
     Ints,
 )
 from fusion.odometry import IS_ODOMETRY, move_by_odometry, spread_by_odometry
-from fusion.place_watch import ON_MAP, RELEASE, RELEASED, TURNED, forget_places, return_to_map, status_of, tally, watch
+from fusion.place_watch import ON_MAP, RELEASE, RELEASED, TURNED, return_to_map, status_of, tally, watch
 from fusion.so3_kernels import (
     apply,
     multiply,
     multiply_transposed_left,
-    multiply_transposed_right,
 )
+from fusion.starting import adopt, cast_vote, restart_if_lost, try_to_start
 from fusion.tape import (
     note_clone,
     note_correction,
@@ -103,11 +84,9 @@ from fusion.tape import (
     note_forgetting,
     note_meeting,
     note_odometry,
-    note_restart,
     note_row,
     note_step,
 )
-from fusion.votes import VOTE_ARM, VOTE_AXIS, VOTE_DISTANCE, VOTE_OBJECT, VOTE_ORDER, VOTE_PLACE
 
 # Places in the limits.
 LIMIT_BOTH, LIMIT_ROTATION, LIMIT_POSITION, PARTIAL, NOMINAL_OFFSET, ADAPTATION, MAX_SCALE, JUMP_AFTER, SETTLED = range(
@@ -327,9 +306,9 @@ def measure(
                 decisions[j] = ACCEPTED
     account(m, w, first, last, kinds, objects, rotations, translations, covariances, rate, decisions, nis)
     if c[MODE] == INITIALISING:
-        _try_to_start(m, w)
+        try_to_start(m, w)
     else:
-        _restart_if_lost(m, w)
+        restart_if_lost(m, w)
     if odometry < first and c[MODE] == TRACKING:
         _clone(m)
 
@@ -347,7 +326,7 @@ def meet(m: Memory, w: Work, k: int, rotation: Array, translation: Array, rate: 
         return_to_map(m, k)
     if found == START_AGAIN:
         m.inliers[:] = 0
-        _adopt(m, w, GYRO_BIAS_ERROR)
+        adopt(m, w, GYRO_BIAS_ERROR)
         for i in range(m.layout[N_OBJECTS]):
             m.known[i] = 1.0 if i == k else 0.0
         forget_rivals(m, True)
@@ -384,7 +363,7 @@ def account(
     c, accepted, refused = m.counters, False, 0
     for j in range(first, last):
         _follow_jumps(m, kinds[j], objects[j], decisions[j])
-        _vote(m, w, kinds[j], objects[j], rotations[j], translations[j], decisions[j])
+        cast_vote(m, w, kinds[j], objects[j], rotations[j], translations[j], decisions[j])
         accepted = accepted or decisions[j] & ACCEPTED != 0
         refused += decisions[j] == REJECTED
         if c[MODE] == TRACKING:
@@ -553,196 +532,6 @@ def _fit_object_symmetry(m: Memory, w: Work, k: int, R_m: Array, rate: Array) ->
     at = OBJECTS + OBJECT_SIZE * k
     multiply_transposed_left(R_wc, m.x[at : at + 9], R_co)
     fit_symmetry(R_m, R_co, m.axes[k], m.orders[k], w.R, w.scratch)
-
-
-@njit(cache=True)
-def _vote(m: Memory, w: Work, kind: int, k: int, rotation: Array, translation: Array, decision: int) -> None:
-    """Remember where a measurement puts the imu."""
-    if kind == OBJECT_POSE and (m.known[k] == 0.0 or status_of(m, kind, k) != ON_MAP):
-        return
-    slot = m.counters[VOTE_HEAD] & (len(m.vote_stamps) - 1)
-    vote = m.votes[slot]
-    R_wc, R_wi, lever, p_wc = w.step[0:9], vote[0:9], w.step[9:12], w.step[12:15]
-    if kind == OBJECT_POSE:
-        at = OBJECTS + OBJECT_SIZE * k
-        multiply_transposed_right(m.x[at : at + 9], rotation, R_wc)
-        apply(R_wc, translation[0], translation[1], translation[2], lever)
-        for i in range(3):
-            p_wc[i] = m.x[at + 9 + i] - lever[i]
-        distance = math.sqrt(translation[0] ** 2 + translation[1] ** 2 + translation[2] ** 2)
-    else:
-        for i in range(9):
-            R_wc[i] = rotation[i]
-        for i in range(3):
-            p_wc[i] = translation[i]
-        distance = 1.0
-    multiply_transposed_right(R_wc, m.x[EXTRINSIC_ROTATION : EXTRINSIC_ROTATION + 9], R_wi)
-    p_ic = m.x[EXTRINSIC_POSITION : EXTRINSIC_POSITION + 3]
-    apply(R_wi, p_ic[0], p_ic[1], p_ic[2], lever)
-    for i in range(3):
-        vote[9 + i] = p_wc[i] - lever[i]
-        vote[21 + i] = m.x[POSITION + i]
-        vote[VOTE_ARM + i], vote[VOTE_PLACE + i], vote[VOTE_AXIS + i] = 0.0, vote[9 + i], 0.0
-    vote[VOTE_ORDER], vote[VOTE_OBJECT] = 1.0, -1.0
-    if kind == OBJECT_POSE:
-        axis = m.axes[k]
-        vote[VOTE_ORDER], vote[VOTE_OBJECT] = m.orders[k], k
-        apply(m.x[at : at + 9], axis[0], axis[1], axis[2], vote[VOTE_AXIS : VOTE_AXIS + 3])
-        R_ic = m.x[EXTRINSIC_ROTATION : EXTRINSIC_ROTATION + 9]
-        apply(R_ic, translation[0], translation[1], translation[2], lever)
-        for i in range(3):
-            vote[VOTE_ARM + i] = p_ic[i] + lever[i]
-            vote[VOTE_PLACE + i] = m.x[at + 9 + i]
-    for i in range(9):
-        vote[12 + i] = m.x[i]
-    m.used[slot] = decision & POSITION_ONLY  # rotation alone does not hold the position
-    vote[VOTE_DISTANCE] = distance
-    m.vote_stamps[slot] = m.counters[NOW]
-    m.counters[VOTE_HEAD] += 1
-
-
-@njit(cache=True)
-def _first_vote(m: Memory, window_s: float, wanted: int) -> int:
-    """Return where the votes of the window start; a window with fewer than wanted votes reaches further back."""
-    head, capacity = m.counters[VOTE_HEAD], len(m.vote_stamps)
-    first = head
-    while first > 0 and head - first < capacity - 1:
-        age = (m.counters[NOW] - m.vote_stamps[(first - 1) & (capacity - 1)]) * 1e-9
-        if age > m.start[LONGEST_WINDOW_S] or (age > window_s and head - first >= wanted):
-            break
-        first -= 1
-    return first
-
-
-@njit(cache=True)
-def _agreement(m: Memory, w: Work, first: int, by_places: bool) -> tuple[int, float, int]:
-    """Return what `largest_agreement` says of the votes since `first`; leave their correction in w.step[96:117].
-
-    The integrated velocity may be right (the votes jump) or wrong (there were none for long), so both are tried.
-    """
-    kept = _agreement_beside(m, w, first, 0.0, by_places)
-    replaced = _agreement_beside(m, w, first, 1.0, by_places)
-    return _agreement_beside(m, w, first, 0.0, by_places) if kept[0] >= replaced[0] else replaced
-
-
-@njit(cache=True)
-def _agreement_beside(
-    m: Memory, w: Work, first: int, share_of_velocity: float, by_places: bool
-) -> tuple[int, float, int]:
-    C, d, v, origin = w.step[96:105], w.step[105:108], w.step[108:111], w.step[111:117]
-    for i in range(3):
-        origin[i] = m.x[POSITION + i]
-        origin[3 + i] = share_of_velocity * m.x[VELOCITY + i]
-    return largest_agreement(
-        m.votes,
-        m.vote_stamps,
-        first,
-        m.counters[VOTE_HEAD],
-        m.counters[NOW],
-        _up(m, w),
-        origin,
-        m.x[GRAVITY : GRAVITY + 3],
-        m.start,
-        C,
-        d,
-        v,
-        by_places,
-        m.inliers,
-        w.step,
-    )
-
-
-@njit(cache=True, _nrt=True)
-def _up(m: Memory, w: Work) -> Array:
-    """Return where the integrated motion has up; zero where nothing feels it."""
-    up = w.step[150:153]
-    for i in range(3):
-        up[i] = m.up[i] if m.start[MAX_TILT] < math.pi else 0.0
-    return up
-
-
-@njit(cache=True)
-def _is_contested(m: Memory, w: Work, first: int) -> bool:
-    """Tell whether the agreement that was found has a rival."""
-    C, d, v, origin = w.step[96:105], w.step[105:108], w.step[108:111], w.step[111:117]
-    g, newest, up = m.x[GRAVITY : GRAVITY + 3], m.counters[VOTE_HEAD], _up(m, w)
-    return has_rival(
-        m.votes, m.vote_stamps, first, newest, m.counters[NOW], up, origin, g, m.start, C, d, v, m.inliers, w.step
-    )
-
-
-@njit(cache=True)
-def _try_to_start(m: Memory, w: Work) -> None:
-    first = _first_vote(m, m.start[START_WINDOW_S], 2 * int(m.start[MIN_VOTES]))
-    count, span, _ = _agreement(m, w, first, False)
-    total = m.counters[VOTE_HEAD] - first
-    if count < max(m.start[MIN_VOTES], m.start[MIN_SHARE] * total):
-        if objects_seen(m.votes, first, m.counters[VOTE_HEAD]) < m.start[MIN_OBJECTS] or m.start[MAX_TILT] >= math.pi:
-            return
-        count, span, objects = _agreement(m, w, first, True)
-        if objects < m.start[MIN_OBJECTS] or count < max(m.start[MIN_VOTES], m.start[MIN_PLACES] * total):
-            return
-    if span < m.start[START_MIN_SPAN_S] or _is_contested(m, w, first):
-        return
-    _adopt(m, w, 0)
-    m.counters[MODE], m.counters[STARTED_AT], m.counters[LAST_UPDATE] = TRACKING, m.counters[NOW], m.counters[NOW]
-
-
-@njit(cache=True)
-def _restart_if_lost(m: Memory, w: Work) -> None:
-    """Start again where hardly anything of late was accepted and what was refused agrees with itself."""
-    since_start = (m.counters[NOW] - m.counters[STARTED_AT]) * 1e-9
-    window = min(m.start[LOST_WINDOW_S], max(m.start[START_WINDOW_S], since_start))  # a wrong start is mended soon
-    first, head = _first_vote(m, window, int(m.start[LOST_MIN_VOTES])), m.counters[VOTE_HEAD]
-    if head - first < m.start[LOST_MIN_VOTES]:
-        return
-    used = 0.0
-    for a in range(first, head):
-        used += m.used[a & (len(m.vote_stamps) - 1)]
-    if used > m.start[LOST_SHARE] * (head - first):
-        return
-    m.up[0], m.up[1], m.up[2] = 0.0, 0.0, 1.0
-    count = _agreement(m, w, first, False)[0]
-    if count >= m.start[LOST_MIN_VOTES] and count > 3.0 * used and not _is_contested(m, w, first):
-        _adopt(m, w, GYRO_BIAS_ERROR)
-        m.counters[RESTARTS] += 1
-        m.counters[STARTED_AT] = m.counters[NOW]
-
-
-@njit(cache=True)
-def _adopt(m: Memory, w: Work, keep_from: int) -> None:
-    """Move the state to the agreed pose; error states before keep_from (all where 0) and object biases start anew."""
-    if len(m.tape) > 0:
-        note_restart(m, keep_from)
-    C, d, v, origin, turned = w.step[96:105], w.step[105:108], w.step[108:111], w.step[111:117], w.step[0:9]
-    multiply(C, m.x[0:9], turned)
-    for i in range(9):
-        m.x[i] = turned[i]
-    kept = w.step[9:12]
-    apply(C, m.x[VELOCITY] - origin[3], m.x[VELOCITY + 1] - origin[4], m.x[VELOCITY + 2] - origin[5], kept)
-    for i in range(3):
-        m.x[POSITION + i] = d[i]
-        m.x[VELOCITY + i] = kept[i] + v[i]
-    n = m.layout[N_ERROR]
-    at = m.layout[AT_BIASES]
-    biases = 6 * m.layout[N_OBJECTS] * m.layout[N_BIAS_KINDS]
-    for i in range(n):
-        if i >= keep_from and keep_from > 0 and not (at >= 0 and at <= i < at + biases):
-            continue
-        for j in range(n):
-            m.P[i, j] = m.P[j, i] = 0.0
-        m.P[i, i] = m.prior[i] ** 2
-    for i in range(biases):
-        kind, component = i // (6 * m.layout[N_OBJECTS]), i % 6
-        m.x[m.layout[BIASES] + i] = 0.0
-        m.P[at + i, at + i] = bias_sigma(m.bias_model, kind, component) ** 2
-    m.counters[BIAS_TIME], m.counters[CLONED] = m.counters[NOW], 0
-    forget_places(m)
-    forget_rivals(m, False)
-    # The agreeing votes count as used, so that a restart is not followed by the next at once.
-    for a in range(len(m.inliers)):
-        if m.inliers[a]:
-            m.used[a] = 1.0
 
 
 @njit(cache=True)

@@ -13,7 +13,7 @@ import numpy as np
 from filterpy.kalman import predict, update
 from scipy.spatial.transform import Rotation
 
-from fusion import filter_loop, imu, memory, odometry
+from fusion import filter_loop, imu, memory, odometry, starting
 from fusion.eskf import (
     ACCEPTED,
     BIAS_JUMP,
@@ -287,9 +287,9 @@ class ReferenceFilter:
                     decisions[j] = ACCEPTED
         filter_loop.account(m, self.work, first, last, *measured, rate, decisions, nis)
         if self.tracking:
-            filter_loop._restart_if_lost(m, self.work)
+            starting.restart_if_lost(m, self.work)
         else:
-            filter_loop._try_to_start(m, self.work)
+            starting.try_to_start(m, self.work)
         if odometry < first and self.tracking:
             self.clone()
 

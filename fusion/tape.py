@@ -178,7 +178,7 @@ def note_forgetting(m: Memory, k: int, first: int) -> None:
 
 @njit(cache=True)
 def note_restart(m: Memory, keep_from: int) -> None:
-    """Write down which error states survive a restart (`filter_loop._adopt`)."""
+    """Write down which error states survive a restart (`starting.adopt`)."""
     at, n = m.counters[TAPE_END], m.layout[N_ERROR]
     first, biases = m.layout[AT_BIASES], 6 * m.layout[N_OBJECTS] * m.layout[N_BIAS_KINDS]
     for i in range(n):

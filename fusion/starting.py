@@ -1,0 +1,259 @@
+"""Where the filter starts, and starts again when it is lost: from votes that agree with each other."""
+
+from __future__ import annotations
+
+import math
+
+from fusion.compiled import njit
+from fusion.consensus import (
+    LONGEST_WINDOW_S,
+    LOST_MIN_VOTES,
+    LOST_SHARE,
+    LOST_WINDOW_S,
+    MAX_TILT,
+    MIN_OBJECTS,
+    MIN_PLACES,
+    MIN_SHARE,
+    MIN_VOTES,
+    START_MIN_SPAN_S,
+    START_WINDOW_S,
+    has_rival,
+    largest_agreement,
+    objects_seen,
+)
+from fusion.eskf import (
+    POSITION_ONLY,
+    bias_sigma,
+)
+from fusion.measurements import OBJECT_POSE
+from fusion.meeting import forget_rivals
+from fusion.memory import (
+    BIAS_TIME,
+    CLONED,
+    LAST_UPDATE,
+    MODE,
+    NOW,
+    RESTARTS,
+    STARTED_AT,
+    TRACKING,
+    VOTE_HEAD,
+    Memory,
+    Work,
+)
+from fusion.nav_state import (
+    AT_BIASES,
+    BIASES,
+    EXTRINSIC_POSITION,
+    EXTRINSIC_ROTATION,
+    GRAVITY,
+    GYRO_BIAS_ERROR,
+    N_BIAS_KINDS,
+    N_ERROR,
+    N_OBJECTS,
+    OBJECT_SIZE,
+    OBJECTS,
+    POSITION,
+    VELOCITY,
+    Array,
+)
+from fusion.place_watch import ON_MAP, forget_places, status_of
+from fusion.so3_kernels import (
+    apply,
+    multiply,
+    multiply_transposed_right,
+)
+from fusion.tape import (
+    note_restart,
+)
+from fusion.votes import VOTE_ARM, VOTE_AXIS, VOTE_DISTANCE, VOTE_OBJECT, VOTE_ORDER, VOTE_PLACE
+
+
+@njit(cache=True)
+def cast_vote(m: Memory, w: Work, kind: int, k: int, rotation: Array, translation: Array, decision: int) -> None:
+    """Remember where a measurement puts the imu."""
+    if kind == OBJECT_POSE and (m.known[k] == 0.0 or status_of(m, kind, k) != ON_MAP):
+        return
+    slot = m.counters[VOTE_HEAD] & (len(m.vote_stamps) - 1)
+    vote = m.votes[slot]
+    R_wc, R_wi, lever, p_wc = w.step[0:9], vote[0:9], w.step[9:12], w.step[12:15]
+    if kind == OBJECT_POSE:
+        at = OBJECTS + OBJECT_SIZE * k
+        multiply_transposed_right(m.x[at : at + 9], rotation, R_wc)
+        apply(R_wc, translation[0], translation[1], translation[2], lever)
+        for i in range(3):
+            p_wc[i] = m.x[at + 9 + i] - lever[i]
+        distance = math.sqrt(translation[0] ** 2 + translation[1] ** 2 + translation[2] ** 2)
+    else:
+        for i in range(9):
+            R_wc[i] = rotation[i]
+        for i in range(3):
+            p_wc[i] = translation[i]
+        distance = 1.0
+    multiply_transposed_right(R_wc, m.x[EXTRINSIC_ROTATION : EXTRINSIC_ROTATION + 9], R_wi)
+    p_ic = m.x[EXTRINSIC_POSITION : EXTRINSIC_POSITION + 3]
+    apply(R_wi, p_ic[0], p_ic[1], p_ic[2], lever)
+    for i in range(3):
+        vote[9 + i] = p_wc[i] - lever[i]
+        vote[21 + i] = m.x[POSITION + i]
+        vote[VOTE_ARM + i], vote[VOTE_PLACE + i], vote[VOTE_AXIS + i] = 0.0, vote[9 + i], 0.0
+    vote[VOTE_ORDER], vote[VOTE_OBJECT] = 1.0, -1.0
+    if kind == OBJECT_POSE:
+        axis = m.axes[k]
+        vote[VOTE_ORDER], vote[VOTE_OBJECT] = m.orders[k], k
+        apply(m.x[at : at + 9], axis[0], axis[1], axis[2], vote[VOTE_AXIS : VOTE_AXIS + 3])
+        R_ic = m.x[EXTRINSIC_ROTATION : EXTRINSIC_ROTATION + 9]
+        apply(R_ic, translation[0], translation[1], translation[2], lever)
+        for i in range(3):
+            vote[VOTE_ARM + i] = p_ic[i] + lever[i]
+            vote[VOTE_PLACE + i] = m.x[at + 9 + i]
+    for i in range(9):
+        vote[12 + i] = m.x[i]
+    m.used[slot] = decision & POSITION_ONLY  # rotation alone does not hold the position
+    vote[VOTE_DISTANCE] = distance
+    m.vote_stamps[slot] = m.counters[NOW]
+    m.counters[VOTE_HEAD] += 1
+
+
+@njit(cache=True)
+def _first_vote(m: Memory, window_s: float, wanted: int) -> int:
+    """Return where the votes of the window start; a window with fewer than wanted votes reaches further back."""
+    head, capacity = m.counters[VOTE_HEAD], len(m.vote_stamps)
+    first = head
+    while first > 0 and head - first < capacity - 1:
+        age = (m.counters[NOW] - m.vote_stamps[(first - 1) & (capacity - 1)]) * 1e-9
+        if age > m.start[LONGEST_WINDOW_S] or (age > window_s and head - first >= wanted):
+            break
+        first -= 1
+    return first
+
+
+@njit(cache=True)
+def _agreement(m: Memory, w: Work, first: int, by_places: bool) -> tuple[int, float, int]:
+    """Return what `largest_agreement` says of the votes since `first`; leave their correction in w.step[96:117].
+
+    The integrated velocity may be right (the votes jump) or wrong (there were none for long), so both are tried.
+    """
+    kept = _agreement_beside(m, w, first, 0.0, by_places)
+    replaced = _agreement_beside(m, w, first, 1.0, by_places)
+    return _agreement_beside(m, w, first, 0.0, by_places) if kept[0] >= replaced[0] else replaced
+
+
+@njit(cache=True)
+def _agreement_beside(
+    m: Memory, w: Work, first: int, share_of_velocity: float, by_places: bool
+) -> tuple[int, float, int]:
+    C, d, v, origin = w.step[96:105], w.step[105:108], w.step[108:111], w.step[111:117]
+    for i in range(3):
+        origin[i] = m.x[POSITION + i]
+        origin[3 + i] = share_of_velocity * m.x[VELOCITY + i]
+    return largest_agreement(
+        m.votes,
+        m.vote_stamps,
+        first,
+        m.counters[VOTE_HEAD],
+        m.counters[NOW],
+        _up(m, w),
+        origin,
+        m.x[GRAVITY : GRAVITY + 3],
+        m.start,
+        C,
+        d,
+        v,
+        by_places,
+        m.inliers,
+        w.step,
+    )
+
+
+@njit(cache=True, _nrt=True)
+def _up(m: Memory, w: Work) -> Array:
+    """Return where the integrated motion has up; zero where nothing feels it."""
+    up = w.step[150:153]
+    for i in range(3):
+        up[i] = m.up[i] if m.start[MAX_TILT] < math.pi else 0.0
+    return up
+
+
+@njit(cache=True)
+def _is_contested(m: Memory, w: Work, first: int) -> bool:
+    """Tell whether the agreement that was found has a rival."""
+    C, d, v, origin = w.step[96:105], w.step[105:108], w.step[108:111], w.step[111:117]
+    g, newest, up = m.x[GRAVITY : GRAVITY + 3], m.counters[VOTE_HEAD], _up(m, w)
+    return has_rival(
+        m.votes, m.vote_stamps, first, newest, m.counters[NOW], up, origin, g, m.start, C, d, v, m.inliers, w.step
+    )
+
+
+@njit(cache=True)
+def try_to_start(m: Memory, w: Work) -> None:
+    """Start where enough votes agree with each other and no other pose has nearly as many."""
+    first = _first_vote(m, m.start[START_WINDOW_S], 2 * int(m.start[MIN_VOTES]))
+    count, span, _ = _agreement(m, w, first, False)
+    total = m.counters[VOTE_HEAD] - first
+    if count < max(m.start[MIN_VOTES], m.start[MIN_SHARE] * total):
+        if objects_seen(m.votes, first, m.counters[VOTE_HEAD]) < m.start[MIN_OBJECTS] or m.start[MAX_TILT] >= math.pi:
+            return
+        count, span, objects = _agreement(m, w, first, True)
+        if objects < m.start[MIN_OBJECTS] or count < max(m.start[MIN_VOTES], m.start[MIN_PLACES] * total):
+            return
+    if span < m.start[START_MIN_SPAN_S] or _is_contested(m, w, first):
+        return
+    adopt(m, w, 0)
+    m.counters[MODE], m.counters[STARTED_AT], m.counters[LAST_UPDATE] = TRACKING, m.counters[NOW], m.counters[NOW]
+
+
+@njit(cache=True)
+def restart_if_lost(m: Memory, w: Work) -> None:
+    """Start again where hardly anything of late was accepted and what was refused agrees with itself."""
+    since_start = (m.counters[NOW] - m.counters[STARTED_AT]) * 1e-9
+    window = min(m.start[LOST_WINDOW_S], max(m.start[START_WINDOW_S], since_start))  # a wrong start is mended soon
+    first, head = _first_vote(m, window, int(m.start[LOST_MIN_VOTES])), m.counters[VOTE_HEAD]
+    if head - first < m.start[LOST_MIN_VOTES]:
+        return
+    used = 0.0
+    for a in range(first, head):
+        used += m.used[a & (len(m.vote_stamps) - 1)]
+    if used > m.start[LOST_SHARE] * (head - first):
+        return
+    m.up[0], m.up[1], m.up[2] = 0.0, 0.0, 1.0
+    count = _agreement(m, w, first, False)[0]
+    if count >= m.start[LOST_MIN_VOTES] and count > 3.0 * used and not _is_contested(m, w, first):
+        adopt(m, w, GYRO_BIAS_ERROR)
+        m.counters[RESTARTS] += 1
+        m.counters[STARTED_AT] = m.counters[NOW]
+
+
+@njit(cache=True)
+def adopt(m: Memory, w: Work, keep_from: int) -> None:
+    """Move the state to the agreed pose; error states before keep_from (all where 0) and object biases start anew."""
+    if len(m.tape) > 0:
+        note_restart(m, keep_from)
+    C, d, v, origin, turned = w.step[96:105], w.step[105:108], w.step[108:111], w.step[111:117], w.step[0:9]
+    multiply(C, m.x[0:9], turned)
+    for i in range(9):
+        m.x[i] = turned[i]
+    kept = w.step[9:12]
+    apply(C, m.x[VELOCITY] - origin[3], m.x[VELOCITY + 1] - origin[4], m.x[VELOCITY + 2] - origin[5], kept)
+    for i in range(3):
+        m.x[POSITION + i] = d[i]
+        m.x[VELOCITY + i] = kept[i] + v[i]
+    n = m.layout[N_ERROR]
+    at = m.layout[AT_BIASES]
+    biases = 6 * m.layout[N_OBJECTS] * m.layout[N_BIAS_KINDS]
+    for i in range(n):
+        if i >= keep_from and keep_from > 0 and not (at >= 0 and at <= i < at + biases):
+            continue
+        for j in range(n):
+            m.P[i, j] = m.P[j, i] = 0.0
+        m.P[i, i] = m.prior[i] ** 2
+    for i in range(biases):
+        kind, component = i // (6 * m.layout[N_OBJECTS]), i % 6
+        m.x[m.layout[BIASES] + i] = 0.0
+        m.P[at + i, at + i] = bias_sigma(m.bias_model, kind, component) ** 2
+    m.counters[BIAS_TIME], m.counters[CLONED] = m.counters[NOW], 0
+    forget_places(m)
+    forget_rivals(m, False)
+    # The agreeing votes count as used, so that a restart is not followed by the next at once.
+    for a in range(len(m.inliers)):
+        if m.inliers[a]:
+            m.used[a] = 1.0
