@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -63,7 +63,7 @@ def train_preset(options: EmbeddedPresetOptions) -> Path:
     train_detector(TrainDetectorOptions(world, cache, first))
     detector = SmallDetector(SmallDetectorOptions())
     detector.load_state_dict(torch.load(options.out / "detector" / "checkpoint.pt", weights_only=True)["module"])
-    steps = _steps(options, "joint", options.joint_steps, 7e-4)
+    steps = replace(_steps(options, "joint", options.joint_steps, 7e-4), optimizer="muon")
     network = train_embedded(TrainEmbeddedOptions(world, cache, steps, fine_tune=True), detector)
     return finish(network, world, cache, options.out / "embedded.safetensors", history(options.out))
 

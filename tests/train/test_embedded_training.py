@@ -60,11 +60,11 @@ def test_the_detector_learns_a_handful_of_images_by_heart(data, tmp_path):
     assert {"precision", "recall", "val_point_error"} <= set(last)
 
 
-@pytest.mark.parametrize("fine_tune", [False, True])
-def test_an_interrupted_training_ends_as_an_uninterrupted_one(data, tmp_path, fine_tune):
+@pytest.mark.parametrize(("fine_tune", "optimizer"), [(False, "adamw"), (True, "muon")])
+def test_an_interrupted_training_ends_as_an_uninterrupted_one(data, tmp_path, fine_tune, optimizer):
     def train(out, most: int | None = None):
         torch.manual_seed(3)
-        schedule = steps(out, 4, max_steps=most)
+        schedule = steps(out, 4, max_steps=most, optimizer=optimizer)
         options = TrainEmbeddedOptions(data, data / "cache", schedule, TINY_POET, fine_tune=fine_tune, val_images=3)
         return train_embedded(options, SmallDetector(TINY))
 
