@@ -1,4 +1,4 @@
-"""The error-state Kalman filter: innovation, gate, update, and the memory it works in.
+"""The error-state Kalman filter's update: innovation, gate, correction, and what a correction does to the covariance.
 
 Written for compiled loops: the covariance stays symmetric because every update subtracts Z^T Z with Z = L^-1 H P
 and S = L L^T (no inverse, no symmetrising), and the rows of H outside a measurement's own columns are never touched.
@@ -13,6 +13,7 @@ import numpy as np
 
 from fusion.compiled import njit
 from fusion.imu import write_gravity_basis
+from fusion.memory import Memory, Work
 from fusion.nav_state import (
     AT_BIASES,
     AT_CLONE,
@@ -35,22 +36,20 @@ from fusion.nav_state import (
     Array,
     Ints,
 )
-from fusion.so3_kernels import apply, exp_so3, log_so3, multiply, multiply_transposed_left, orthonormalise
+from fusion.so3_kernels import apply, exp_so3, multiply, multiply_transposed_left, orthonormalise
 
 REJECTED, POSITION_ONLY, ROTATION_ONLY, ACCEPTED = 0, 1, 2, 3  # bit 0: position used, bit 1: rotation used
 
-# Places in the bias model, per kind: sigma of rotation (rad), across and along the ray (share of distance), time (s).
-BIAS_ROTATION, BIAS_ACROSS, BIAS_ALONG, BIAS_TAU, BIAS_JUMP, BIAS_JUMP_AT, BIAS_MODEL_SIZE = range(7)
-
 
 @njit(cache=True)
-def innovation(P: Array, H: Array, columns: Ints, count: int, R: Array, n: int, PHt: Array, S: Array) -> None:
-    """Write P H^T as rows (6, n) into PHt and S = H P H^T + R (6, 6)."""
+def innovation(m: Memory, w: Work, count: int) -> None:
+    """Write P H^T as rows (6, n) into w.PHt and S = H P H^T + R (6, 6) into w.S, from `count` columns of H."""
+    n, P, H, PHt = m.layout[N_ERROR], m.P, w.H, w.PHt
     for r in range(6):
         for i in range(n):
             PHt[r, i] = 0.0
     for c in range(count):
-        column = columns[c]
+        column = m.columns[c]
         for r in range(6):
             h = H[r, c]
             if h != 0.0:
@@ -58,10 +57,10 @@ def innovation(P: Array, H: Array, columns: Ints, count: int, R: Array, n: int, 
                     PHt[r, i] += h * P[column, i]
     for r in range(6):
         for s in range(r, 6):
-            total = R[r, s]
+            total = w.R[r, s]
             for c in range(count):
-                total += H[s, c] * PHt[r, columns[c]]
-            S[r, s] = S[s, r] = total
+                total += H[s, c] * PHt[r, m.columns[c]]
+            w.S[r, s] = w.S[s, r] = total
 
 
 @njit(cache=True)
@@ -118,39 +117,43 @@ def gate(S: Array, residual: Array, limits: Array, partial: float, L: Array, whi
 
 
 @njit(cache=True)
-def correct(
-    x: Array,
-    P: Array,
-    PHt: Array,
-    S: Array,
-    residual: Array,
-    first: int,
-    size: int,
-    layout: Ints,
-    L: Array,
-    white: Array,
-    Z: Array,
-    error: Array,
-    scratch: Array,
-) -> None:
-    """Kalman update with rows first..first+size (size 3 or 6) of a measurement: x and P in place."""
-    n = layout[N_ERROR]
-    if not cholesky(S, first, size, L):
+def correct(m: Memory, w: Work, first: int, size: int) -> None:
+    """Kalman update with rows first..first+size (size 3 or 6) of a measurement: state and covariance in place."""
+    if not cholesky(w.S, first, size, w.L):
         return
-    whiten(L, residual, first, size, white)
+    whiten(w.L, w.residual, first, size, w.white)
+    _gain(m, w, first, size)
+    _condition(m.P, w.Z, size)
+    before = w.scratch[32:47]
+    for i in range(15):
+        before[i] = m.x[i]
+    inject(m.x, w.error, m.layout, w.scratch)
+    transport(m.P, before, m.x, w.error, m.layout, w.scratch)
+
+
+@njit(cache=True)
+def _gain(m: Memory, w: Work, first: int, size: int) -> None:
+    """Write Z = L^-1 H P and the mean error Z^T L^-1 residual."""
+    n, Z, error = m.layout[N_ERROR], w.Z, w.error
     for i in range(n):
         error[i] = 0.0
     for r in range(size):
         for i in range(n):
-            Z[r, i] = PHt[first + r, i]
+            Z[r, i] = w.PHt[first + r, i]
         for q in range(r):
-            factor = L[r, q]
+            factor = w.L[r, q]
             for i in range(n):
                 Z[r, i] -= factor * Z[q, i]
-        factor = 1.0 / L[r, r]
+        factor = 1.0 / w.L[r, r]
         for i in range(n):
             Z[r, i] *= factor
-            error[i] += Z[r, i] * white[r]
+            error[i] += Z[r, i] * w.white[r]
+
+
+@njit(cache=True)
+def _condition(P: Array, Z: Array, size: int) -> None:
+    """P <- P - Z^T Z with the first `size` (3 or 6) rows of Z."""
+    n = len(P)
     for i in range(n):
         z0, z1, z2 = Z[0, i], Z[1, i], Z[2, i]
         if size == 6:
@@ -161,11 +164,72 @@ def correct(
         else:
             for j in range(n):
                 P[i, j] -= z0 * Z[0, j] + z1 * Z[1, j] + z2 * Z[2, j]
-    before = scratch[32:47]
-    for i in range(15):
-        before[i] = x[i]
-    inject(x, error, layout, scratch)
-    transport(P, before, x, error, layout, scratch)
+
+
+@njit(cache=True)
+def inject(x: Array, error: Array, layout: Ints, scratch: Array) -> None:
+    """Move the nominal state by an error state, in place (`nav_state.retract_state`)."""
+    _turn(x, 0, error, 0, scratch)
+    for i in range(12):
+        x[POSITION + i] += error[POSITION_ERROR + i]
+    at = layout[AT_EXTRINSICS]
+    if at >= 0:
+        _move_pose(x, EXTRINSIC_ROTATION, error, at, scratch)
+    if layout[AT_TIME_OFFSET] >= 0:
+        x[TIME_OFFSET] += error[layout[AT_TIME_OFFSET]]
+    if layout[AT_GRAVITY] >= 0:
+        _turn_gravity(x, error, layout[AT_GRAVITY], scratch)
+    for k in range(layout[N_OBJECTS] if layout[AT_OBJECTS] >= 0 else 0):
+        _move_pose(x, OBJECTS + OBJECT_SIZE * k, error, layout[AT_OBJECTS] + 6 * k, scratch)
+    if layout[AT_BIASES] >= 0:
+        for i in range(6 * layout[N_OBJECTS] * layout[N_BIAS_KINDS]):
+            x[layout[BIASES] + i] += error[layout[AT_BIASES] + i]
+    if layout[AT_CLONE] >= 0:
+        _move_clone(x, layout[CLONE], error, layout[AT_CLONE], scratch)
+
+
+@njit(cache=True)
+def _turn(x: Array, start: int, error: Array, at: int, scratch: Array) -> None:
+    turn, turned = scratch[0:9], scratch[9:18]
+    exp_so3(error[at], error[at + 1], error[at + 2], turn)
+    multiply(x[start : start + 9], turn, turned)
+    orthonormalise(turned, turn)
+    for i in range(9):
+        x[start + i] = turned[i]
+
+
+@njit(cache=True)
+def _move_pose(x: Array, start: int, error: Array, at: int, scratch: Array) -> None:
+    _turn(x, start, error, at, scratch)
+    for i in range(3):
+        x[start + 9 + i] += error[at + 3 + i]
+
+
+@njit(cache=True)
+def _move_clone(x: Array, start: int, error: Array, at: int, scratch: Array) -> None:
+    """Move the clone by its error in world axes: R <- Exp(xi) R, p <- Exp(xi) p + rho."""
+    turn, turned, moved = scratch[0:9], scratch[9:18], scratch[18:21]
+    exp_so3(error[at], error[at + 1], error[at + 2], turn)
+    multiply(turn, x[start : start + 9], turned)
+    apply(turn, x[start + 9], x[start + 10], x[start + 11], moved)
+    orthonormalise(turned, turn)
+    for i in range(9):
+        x[start + i] = turned[i]
+    for i in range(3):
+        x[start + 9 + i] = moved[i] + error[at + 3 + i]
+
+
+@njit(cache=True)
+def _turn_gravity(x: Array, error: Array, at: int, scratch: Array) -> None:
+    basis = scratch[0:6]
+    write_gravity_basis(x, basis)
+    before = after = 0.0
+    for i in range(3):
+        before += x[GRAVITY + i] ** 2
+        x[GRAVITY + i] += basis[2 * i] * error[at] + basis[2 * i + 1] * error[at + 1]
+        after += x[GRAVITY + i] ** 2
+    for i in range(3):
+        x[GRAVITY + i] *= math.sqrt(before / after)
 
 
 @njit(cache=True)
@@ -223,239 +287,3 @@ def _turn_rows_and_columns(P: Array, n: int, G: Array, scratch: Array) -> None:
         p0, p1, p2 = P[j, 0], P[j, 1], P[j, 2]
         for i in range(3):
             P[j, i] = G[3 * i] * p0 + G[3 * i + 1] * p1 + G[3 * i + 2] * p2
-
-
-@njit(cache=True)
-def adopt_object(
-    x: Array, P: Array, H: Array, columns: Ints, count: int, R: Array, k: int, layout: Ints, work: Array
-) -> None:
-    """Take an object whose pose was unknown into the state, where a detection with zero residual has put it.
-
-    With 0 = H_x dx + H_o do + e its error is do = -H_o^-1 (H_x dx + e), so that P_o. = -H_o^-1 H_x P_x. and
-    P_oo = H_o^-1 (H_x P H_x^T + R) H_o^-T; H_o is a rotation in either half. work holds 6 n + 36 floats.
-    """
-    n, at = layout[N_ERROR], layout[AT_OBJECTS] + 6 * k
-    for i in range(6):
-        for j in range(n):
-            P[at + i, j] = P[j, at + i] = 0.0
-    PHt, S = work[: 6 * n].reshape((6, n)), work[6 * n : 6 * n + 36].reshape((6, 6))
-    innovation(P, H, columns, count, R, n, PHt, S)
-    first = 0
-    while columns[first] != at:
-        first += 1
-    for half in range(2):
-        for i in range(3):
-            for j in range(n):
-                total = 0.0
-                for r in range(3):
-                    total += H[3 * half + r, first + 3 * half + i] * PHt[3 * half + r, j]
-                P[at + 3 * half + i, j] = P[j, at + 3 * half + i] = -total
-    for a in range(6):
-        for b in range(6):
-            total = 0.0
-            for r in range(3):
-                for s in range(3):
-                    left = H[3 * (a // 3) + r, first + a]
-                    right = H[3 * (b // 3) + s, first + b]
-                    total += left * S[3 * (a // 3) + r, 3 * (b // 3) + s] * right
-            P[at + a, at + b] = total
-
-
-@njit(cache=True)
-def inject(x: Array, error: Array, layout: Ints, scratch: Array) -> None:
-    """Move the nominal state by an error state, in place (`nav_state.retract_state`)."""
-    _turn(x, 0, error, 0, scratch)
-    for i in range(12):
-        x[POSITION + i] += error[POSITION_ERROR + i]
-    at = layout[AT_EXTRINSICS]
-    if at >= 0:
-        _turn(x, EXTRINSIC_ROTATION, error, at, scratch)
-        for i in range(3):
-            x[EXTRINSIC_ROTATION + 9 + i] += error[at + 3 + i]
-    if layout[AT_TIME_OFFSET] >= 0:
-        x[TIME_OFFSET] += error[layout[AT_TIME_OFFSET]]
-    if layout[AT_GRAVITY] >= 0:
-        _turn_gravity(x, error, layout[AT_GRAVITY], scratch)
-    for k in range(layout[N_OBJECTS] if layout[AT_OBJECTS] >= 0 else 0):
-        start, at = OBJECTS + OBJECT_SIZE * k, layout[AT_OBJECTS] + 6 * k
-        _turn(x, start, error, at, scratch)
-        for i in range(3):
-            x[start + 9 + i] += error[at + 3 + i]
-    if layout[AT_BIASES] >= 0:
-        for i in range(6 * layout[N_OBJECTS] * layout[N_BIAS_KINDS]):
-            x[layout[BIASES] + i] += error[layout[AT_BIASES] + i]
-    if layout[AT_CLONE] >= 0:
-        start, at = layout[CLONE], layout[AT_CLONE]
-        turn, turned = scratch[0:9], scratch[9:18]
-        exp_so3(error[at], error[at + 1], error[at + 2], turn)
-        multiply(turn, x[start : start + 9], turned)
-        apply(turn, x[start + 9], x[start + 10], x[start + 11], scratch[18:21])
-        orthonormalise(turned, turn)
-        for i in range(9):
-            x[start + i] = turned[i]
-        for i in range(3):
-            x[start + 9 + i] = scratch[18 + i] + error[at + 3 + i]
-
-
-@njit(cache=True)
-def clone_pose(x: Array, P: Array, layout: Ints) -> None:
-    """Let the clone be the pose of now: xi = R theta, rho = dp + p x xi (see `nav_state`), in state and covariance.
-
-    Source: S. Roumeliotis and J. Burdick, "Stochastic cloning", ICRA 2002.
-    """
-    start, at = layout[CLONE], layout[AT_CLONE]
-    for i in range(12):
-        x[start + i] = x[i]
-    for j in range(at):
-        _clone_errors(x, P[:, j], P[at:, j])
-    for j in range(at + 6):
-        _clone_errors(x, P[j], P[j, at:])
-    for i in range(at, at + 6):
-        for j in range(i):
-            P[i, j] = P[j, i] = 0.5 * (P[i, j] + P[j, i])
-
-
-@njit(cache=True)
-def _clone_errors(x: Array, pose: Array, clone: Array) -> None:
-    px, py, pz = x[POSITION], x[POSITION + 1], x[POSITION + 2]
-    a, b, c = pose[0], pose[1], pose[2]
-    u, v, w = x[0] * a + x[1] * b + x[2] * c, x[3] * a + x[4] * b + x[5] * c, x[6] * a + x[7] * b + x[8] * c
-    clone[0], clone[1], clone[2] = u, v, w
-    clone[3], clone[4], clone[5] = pose[3] + py * w - pz * v, pose[4] + pz * u - px * w, pose[5] + px * v - py * u
-
-
-@njit(cache=True)
-def _turn(x: Array, start: int, error: Array, at: int, scratch: Array) -> None:
-    turn, turned = scratch[0:9], scratch[9:18]
-    exp_so3(error[at], error[at + 1], error[at + 2], turn)
-    multiply(x[start : start + 9], turn, turned)
-    orthonormalise(turned, turn)
-    for i in range(9):
-        x[start + i] = turned[i]
-
-
-@njit(cache=True)
-def _turn_gravity(x: Array, error: Array, at: int, scratch: Array) -> None:
-    basis = scratch[0:6]
-    write_gravity_basis(x, basis)
-    before = after = 0.0
-    for i in range(3):
-        before += x[GRAVITY + i] ** 2
-        x[GRAVITY + i] += basis[2 * i] * error[at] + basis[2 * i + 1] * error[at + 1]
-        after += x[GRAVITY + i] ** 2
-    for i in range(3):
-        x[GRAVITY + i] *= math.sqrt(before / after)
-
-
-@njit(cache=True)
-def decay_biases(x: Array, P: Array, seconds: float, bias_model: Array, layout: Ints) -> None:
-    """Let the object biases relax for some seconds: first-order Gauss-Markov, exact for any step.
-
-    b <- phi b, P_b <- phi^2 P_b + (1 - phi^2) sigma^2 with phi = exp(-seconds / tau); an infinite tau stays put. A bias
-    far outside its sigma is a gross error in a run: it does not fade, and it wanders as far as it jumps.
-    Cross terms commute with the IMU's propagation, so this is done once per update and not once per sample.
-    """
-    for kind in range(layout[N_BIAS_KINDS]):
-        model = kind * BIAS_MODEL_SIZE
-        phi = math.exp(-seconds / bias_model[model + BIAS_TAU])
-        if phi == 1.0:
-            continue
-        for k in range(layout[N_OBJECTS]):
-            shift = 6 * (k + kind * layout[N_OBJECTS])
-            for first in (0, 3):
-                _decay(
-                    x,
-                    P,
-                    layout[N_ERROR],
-                    layout[BIASES] + shift,
-                    layout[AT_BIASES] + shift,
-                    first,
-                    kind,
-                    phi,
-                    bias_model,
-                )
-
-
-@njit(cache=True)
-def _decay(x: Array, P: Array, n: int, b: int, at: int, first: int, kind: int, phi: float, bias_model: Array) -> None:
-    fading = fades(x, b, first, kind, bias_model)
-    for i in range(first, first + 3):
-        sigma = bias_sigma(bias_model, kind, i)
-        if fading:
-            x[b + i] *= phi
-            for j in range(n):
-                P[at + i, j] *= phi
-            for j in range(n):
-                P[j, at + i] *= phi
-        else:
-            sigma *= bias_model[kind * BIAS_MODEL_SIZE + BIAS_JUMP]
-        P[at + i, at + i] += (1.0 - phi * phi) * sigma * sigma
-
-
-@njit(cache=True)
-def fades(x: Array, b: int, first: int, kind: int, bias_model: Array) -> bool:
-    """Tell whether half of the bias at x[b:] is no gross error, so that it relaxes."""
-    furthest = 0.0
-    for i in range(first, first + 3):
-        furthest = max(furthest, abs(x[b + i]) / bias_sigma(bias_model, kind, i))
-    return furthest <= bias_model[kind * BIAS_MODEL_SIZE + BIAS_JUMP_AT]
-
-
-@njit(cache=True)
-def forget_bias(
-    x: Array, P: Array, k: int, first: int, bias_model: Array, layout: Ints, kind: int, jumped: bool
-) -> None:
-    """Forget an object's bias of rotation (first 0) or translation (3).
-
-    Its mean becomes zero again and its sigma, if it jumped, a multiple of the stationary one; what it knew of other
-    states is dropped.
-    """
-    shift = 6 * (k + kind * layout[N_OBJECTS])
-    n, at, b = layout[N_ERROR], layout[AT_BIASES] + shift, layout[BIASES] + shift
-    for i in range(first, first + 3):
-        x[b + i] = 0.0
-        for j in range(n):
-            P[at + i, j] = P[j, at + i] = 0.0
-        scale = bias_model[BIAS_JUMP] if jumped else 1.0
-        P[at + i, at + i] = (scale * bias_sigma(bias_model, kind, i)) ** 2
-
-
-@njit(cache=True)
-def bias_sigma(bias_model: Array, kind: int, component: int) -> float:
-    """Return the stationary 1-sigma of one bias component: rotation (rad) 0-2, across x, across y, along 3-5."""
-    model = kind * BIAS_MODEL_SIZE
-    if component < 3:
-        return bias_model[model + BIAS_ROTATION]
-    return bias_model[model + (BIAS_ALONG if component == 5 else BIAS_ACROSS)]
-
-
-@njit(cache=True)
-def fit_symmetry(R_m: Array, R_co: Array, axis: Array, order: int, R: Array, scratch: Array) -> None:
-    """Turn a measured rotation R_m (9,), in place, about the symmetry axis to where it fits the prediction best.
-
-    order 1: none; n > 1: by a multiple of 2 pi / n; 0: continuous, and then the variance about the axis in R (6, 6)
-    becomes so large that only the two rows across it count. The best turn is the twist of R_m^T R_co about the axis.
-    """
-    if order == 1:
-        return
-    difference, vector, turn = scratch[0:9], scratch[9:12], scratch[12:21]
-    multiply_transposed_left(R_m, R_co, difference)
-    log_so3(difference, vector)
-    angle = math.sqrt(vector[0] ** 2 + vector[1] ** 2 + vector[2] ** 2)
-    along = axis[0] * vector[0] + axis[1] * vector[1] + axis[2] * vector[2]
-    half = 0.5 * angle
-    sine = along * (math.sin(half) / angle if angle > 1e-9 else 0.5)
-    twist = 2.0 * math.atan2(sine, math.cos(half))
-    if order > 1:
-        step = 2.0 * math.pi / order
-        twist = step * math.floor(twist / step + 0.5)
-    exp_so3(twist * axis[0], twist * axis[1], twist * axis[2], turn)
-    multiply(R_m, turn, difference)
-    for i in range(9):
-        R_m[i] = difference[i]
-    if order == 0:
-        for i in range(3):
-            for j in range(3):
-                a_i = R_m[3 * i] * axis[0] + R_m[3 * i + 1] * axis[1] + R_m[3 * i + 2] * axis[2]
-                a_j = R_m[3 * j] * axis[0] + R_m[3 * j + 1] * axis[1] + R_m[3 * j + 2] * axis[2]
-                R[i, j] += 1e3 * a_i * a_j

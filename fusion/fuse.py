@@ -5,7 +5,6 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from dataclasses import replace
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,6 +12,7 @@ from scipy.spatial.transform import RigidTransform
 
 from fusion import filter_loop, memory
 from fusion.calibrated import calibrated
+from fusion.columns import OUT_CORE, OUT_COVARIANCE, OUT_SIGMA, Columns, Rows
 from fusion.eskf import POSITION_ONLY, ROTATION_ONLY
 from fusion.health import run_health
 from fusion.imu_noise import imu_rows
@@ -26,26 +26,6 @@ from poet_loc.core.records import CameraPoses, ObjectPoses
 from poet_loc.io.log_folder import Log
 
 Array = NDArray[np.float64]
-Stamps = NDArray[np.int64]
-
-
-class LoopColumns(NamedTuple):
-    """What a loop over a whole log reads and writes, in the order of its arguments."""
-
-    imu_stamps: Stamps
-    imu_values: Array
-    stamps: Stamps
-    kinds: Stamps
-    objects: Stamps
-    rotations: Array
-    translations: Array
-    covariances: Array
-    decisions: Stamps
-    nis: Array
-    out_stamps: Stamps
-    out_core: Array
-    out_sigma: Array
-    out_covariance: Array
 
 
 def fuse(
@@ -88,18 +68,18 @@ def run_filter(
     """
     began = time.perf_counter()
     floats, integers = fill_memory(problem, options)
-    columns = loop_columns(problem)
-    written = loop(floats, integers, *columns)
+    columns, rows = loop_columns(problem)
+    written = loop(floats, integers, columns, rows)
     if written == 0:
         raise never_started(problem, options)
     m = memory.views.py_func(floats, integers)
     result = result_from_rows(
         f"fuse/{estimator}/{options.measurements}",
         (
-            columns.out_stamps[:written],
-            columns.out_core[:written],
-            columns.out_sigma[:written],
-            columns.out_covariance[:written].reshape(-1, 6, 6),
+            rows.stamps[:written],
+            rows.core[:written],
+            rows.sigma[:written],
+            rows.covariance[:written].reshape(-1, 6, 6),
         ),
         gate_log(problem, columns.decisions, columns.nis),
         time.perf_counter() - began,
@@ -108,11 +88,11 @@ def run_filter(
     return replace(result, motion=problem.motion, body=problem.body, calibrated=calibrated(m, problem))
 
 
-def loop_columns(problem: Problem) -> LoopColumns:
-    """Return what a loop over the problem's whole log reads and has room to write."""
+def loop_columns(problem: Problem) -> tuple[Columns, Rows]:
+    """Return what a loop over the problem's whole log reads, and room for what it writes."""
     measured, imu = problem.measurements, problem.imu
     count, rows = len(measured), len(imu) + len(measured)
-    return LoopColumns(
+    columns = Columns(
         imu.stamps_ns,
         imu_rows(imu),
         measured.stamps_ns,
@@ -123,11 +103,9 @@ def loop_columns(problem: Problem) -> LoopColumns:
         measured.covariances,
         np.zeros(count, dtype=np.int64),
         np.full((count, 3), np.nan),
-        np.zeros(rows, dtype=np.int64),
-        np.zeros((rows, filter_loop.OUT_CORE)),
-        np.zeros((rows, filter_loop.OUT_SIGMA)),
-        np.zeros((rows, filter_loop.OUT_COVARIANCE)),
     )
+    sizes = (OUT_CORE, OUT_SIGMA, OUT_COVARIANCE)
+    return columns, Rows(np.zeros(rows, dtype=np.int64), *(np.zeros((rows, size)) for size in sizes))
 
 
 def never_started(problem: Problem, options: FuseOptions) -> InputError:

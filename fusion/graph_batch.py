@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from fusion import eskf, memory
 from fusion.calibrated import calibrated
 from fusion.eskf import ACCEPTED
-from fusion.filter_loop import PARTIAL
+from fusion.filter_update import PARTIAL
 from fusion.fuse import gate_log, never_started, result_from_rows
 from fusion.graph_builder import GraphBuilder
 from fusion.graph_factors import Detection, error_at
@@ -262,10 +262,10 @@ def _joint(stretch: Stretch, i: int, with_imu: bool) -> Array:
 
 
 def _put_rows(walk: Walk, rows: slice, core: Array, covariance: Array) -> None:
-    c, size = walk.columns, covariance.shape[1]
-    c.out_core[rows] = core
-    c.out_sigma[rows, :size] = np.sqrt(np.diagonal(covariance, axis1=1, axis2=2).clip(min=0.0))
-    c.out_covariance[rows] = covariance[:, :6, :6].reshape(-1, 36)
+    out, size = walk.out, covariance.shape[1]
+    out.core[rows] = core
+    out.sigma[rows, :size] = np.sqrt(np.diagonal(covariance, axis1=1, axis2=2).clip(min=0.0))
+    out.covariance[rows] = covariance[:, :6, :6].reshape(-1, 36)
 
 
 def _write_statics(stretch: Stretch, builder: GraphBuilder, m: memory.Memory) -> None:

@@ -10,9 +10,9 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
-from fusion import eskf
+from fusion import object_biases
+from fusion.columns import Columns
 from fusion.eskf import ACCEPTED
-from fusion.fuse import LoopColumns
 from fusion.graph_factors import Detection, Model, bias_factor, common_variables, linear_factor, measurement_factor
 from fusion.graph_linear import KERNELS, linearise
 from fusion.graph_model import bias_step
@@ -46,18 +46,18 @@ class BiasModel:
 
     def stationary(self, kind: int) -> Array:
         """Return the stationary 1-sigma (6,) of a kind of bias."""
-        return np.array([eskf.bias_sigma(self.values, kind, i) for i in range(6)])
+        return np.array([object_biases.bias_sigma(self.values, kind, i) for i in range(6)])
 
     def jumped(self, kind: int) -> Array:
         """Return the 1-sigma (6,) of a bias that was forgotten: the varying one has jumped."""
-        return self.stationary(kind) * (float(self.values[eskf.BIAS_JUMP]) if kind == 0 else 1.0)
+        return self.stationary(kind) * (float(self.values[object_biases.BIAS_JUMP]) if kind == 0 else 1.0)
 
     def constant(self, kind: int) -> bool:
         """Tell whether a kind of bias stays as it is for ever."""
-        return bool(self.values[kind * eskf.BIAS_MODEL_SIZE + eskf.BIAS_TAU] == np.inf)
+        return bool(self.values[kind * object_biases.BIAS_MODEL_SIZE + object_biases.BIAS_TAU] == np.inf)
 
     def step(self, kind: int, mean: Array, seconds: float) -> tuple[Array, Array]:
-        """Return factor and 1-sigma, each (6,), of what a bias does in some seconds (`eskf.decay_biases`)."""
+        """Return factor and 1-sigma, each (6,), of what a bias does in some seconds (`object_biases.decay_biases`)."""
         left, sigma = np.empty(6), np.empty(6)
         bias_step(self.values, kind, mean, seconds, left, sigma)
         return left, sigma
@@ -210,7 +210,7 @@ class GraphBuilder:
         self.clone = self.keyframe
         self.origin[self._clone_variable().place] = self.origin[:OBJECT_SIZE]
 
-    def add_linearised(self, columns: LoopColumns, rotations: Array, covariances: Array, which: range) -> None:
+    def add_linearised(self, columns: Columns, rotations: Array, covariances: Array, which: range) -> None:
         """Add measurements that passed the gate to the newest keyframe, linearised where its variables start.
 
         rotations and covariances are those that the filter used.

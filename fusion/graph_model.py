@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 
 from fusion.compiled import njit
-from fusion.eskf import BIAS_JUMP, BIAS_MODEL_SIZE, BIAS_TAU, bias_sigma, fades
 from fusion.imu import propagate_nominal
 from fusion.measurements import MAX_COLUMNS, OBJECT_POSE, residual_and_jacobian, write_bias_axes
 from fusion.nav_state import (
@@ -27,6 +26,7 @@ from fusion.nav_state import (
     Array,
     Ints,
 )
+from fusion.object_biases import BIAS_JUMP, BIAS_MODEL_SIZE, BIAS_TAU, bias_sigma, fades
 from fusion.odometry import move_by_odometry
 from fusion.so3_kernels import apply, apply_transposed, multiply
 

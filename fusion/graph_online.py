@@ -22,7 +22,8 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation
 
 from fusion import memory
-from fusion.fuse import LoopColumns, loop_columns
+from fusion.columns import Columns
+from fusion.fuse import loop_columns
 from fusion.graph_builder import GraphBuilder
 from fusion.graph_motion import MotionChain
 from fusion.graph_smoother import FixedLagSmoother
@@ -80,7 +81,7 @@ class GraphEstimator(Estimator):
         seconds = 2.0 * self.options.graph.lag_s + self.online.ahead_s + 1.0
         poses = int(seconds * self.online.max_pose_rate_hz)
         samples = int(seconds * self.online.max_imu_rate_hz)
-        self._room = loop_columns(_room_for(self._problem, samples, poses))
+        self._room, self._walk.out = loop_columns(_room_for(self._problem, samples, poses))
         self._rotations, self._covariances = np.zeros((poses, 9)), np.zeros((poses, 6, 6))
         self._samples = self._poses = 0
         self._rate, self._force = np.zeros(3), np.zeros(3)
@@ -176,8 +177,8 @@ class GraphEstimator(Estimator):
         if self._samples == 0:
             return
         walk, room, n, m = self._walk, self._room, self._samples, self._poses
-        filled: list[Any] = [column[: n if i < 2 else m] if i < 10 else column for i, column in enumerate(room)]
-        walk.columns = LoopColumns(*filled)
+        filled: list[Any] = [column[: n if i < 2 else m] for i, column in enumerate(room)]
+        walk.columns = Columns(*filled)
         walk.rotations, walk.covariances = self._rotations[:m], self._covariances[:m]
         if not walk.begun:
             walk.begin()
@@ -229,7 +230,7 @@ class GraphEstimator(Estimator):
         since = oldest.now if oldest.smoother is None else min(oldest.now, oldest.smoother.builder.stamp_ns)
         samples = max(0, int(np.searchsorted(room.imu_stamps[: self._samples], since)) - REACH)
         poses = int(oldest.cursor[NEXT]) if oldest.smoother is None else oldest.first
-        for i, column in enumerate((*room[:10], self._rotations, self._covariances)):
+        for i, column in enumerate((*room, self._rotations, self._covariances)):
             gone = samples if i < 2 else poses
             column[: len(column) - gone] = column[gone:].copy()
         self._samples, self._poses = self._samples - samples, self._poses - poses

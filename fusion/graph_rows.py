@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 
 from fusion import memory
 from fusion.compiled import njit
-from fusion.filter_loop import advance
+from fusion.filter_motion import advance
 from fusion.memory import IMU_AT, MODE, NOW, TRACKING, views, work_views
 from fusion.nav_state import CORE, EXTRINSIC_ROTATION, OBJECTS, StateLayout
 

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg.lapack import dtrtri
 
-from fusion.eskf import ACCEPTED, POSITION_ONLY, ROTATION_ONLY, clone_pose
+from fusion.eskf import ACCEPTED, POSITION_ONLY, ROTATION_ONLY
 from fusion.graph_builder import GraphBuilder
 from fusion.graph_factors import Detection
 from fusion.graph_model import seen_at
@@ -23,6 +23,7 @@ from fusion.graph_odometry import odometry_at
 from fusion.graph_walk import Keyframe, Walk
 from fusion.measurements import CAMERA_POSE, OBJECT_POSE, ODOMETRY_STEP
 from fusion.memory import CLONED, Memory
+from fusion.new_states import clone_pose
 from fusion.options import Graph
 
 Array = NDArray[np.float64]

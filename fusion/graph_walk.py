@@ -9,16 +9,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fusion import memory
+from fusion.columns import Columns, Rows, read_fitted
 from fusion.compiled import njit
-from fusion.eskf import fit_symmetry
-from fusion.filter_loop import advance, angular_velocity_at, begin, emit, measure
+from fusion.filter_loop import emit, end_of_stamp, measure
+from fusion.filter_motion import advance, begin, find_rate
 from fusion.fuse import loop_columns
-from fusion.measurements import OBJECT_POSE, ODOMETRY_STEP, camera_in_world
-from fusion.memory import MODE, NOW, REPLACED, RESTARTS, TRACKING, Memory, Work, views, work_views
-from fusion.nav_state import AT_BIASES, N_BIAS_KINDS, N_OBJECTS, OBJECT_SIZE, OBJECTS, TIME_OFFSET, Array, Ints
+from fusion.measurements import ODOMETRY_STEP
+from fusion.memory import MODE, NOW, REPLACED, RESTARTS, TRACKING, Memory, views, work_views
+from fusion.nav_state import AT_BIASES, N_BIAS_KINDS, N_OBJECTS, Array, Ints
 from fusion.options import FuseOptions
 from fusion.prepare import Problem, fill_memory
-from fusion.so3_kernels import multiply_transposed_left
 
 # Places in the cursor: next IMU row, next measurement, rows written, stamp of the newest keyframe.
 IMU_ROW, NEXT, ROWS, KEYFRAME_NS, CURSOR_SIZE = range(5)
@@ -42,23 +42,11 @@ def filter_until_keyframe(
     cursor: Ints,
     spacing_ns: int,
     idle_ns: int,
-    imu_stamps: Ints,
-    imu_values: Array,
-    stamps: Ints,
-    kinds: Ints,
-    objects: Ints,
-    rotations: Array,
-    translations: Array,
-    covariances: Array,
+    log: Columns,
     fitted_rotations: Array,
     fitted_covariances: Array,
     fresh: Ints,
-    decisions: Ints,
-    nis: Array,
-    out_stamps: Ints,
-    out_core: Array,
-    out_sigma: Array,
-    out_covariance: Array,
+    rows: Rows,
 ) -> int:
     """Filter up to the next keyframe and return KEYFRAME, STARTED where the filter (re)started or put an object
     elsewhere there, or END.
@@ -71,36 +59,35 @@ def filter_until_keyframe(
     """
     m = views(floats, integers)
     w = work_views(m.work, len(m.P))
-    rate = np.zeros(3)
+    imu_stamps, stamps = log.imu_stamps, log.stamps
     while cursor[IMU_ROW] < len(imu_stamps):
         k, j = cursor[IMU_ROW], cursor[NEXT]
         if j < len(stamps) and stamps[j] <= imu_stamps[k]:
-            last, restarts, tracked = j, m.counters[RESTARTS] + m.counters[REPLACED], m.counters[MODE] == TRACKING
-            while last < len(stamps) and stamps[last] == stamps[j]:
-                last += 1
-            advance(m, w, imu_stamps, imu_values, stamps[j])
-            angular_velocity_at(m, imu_stamps, imu_values, rate)
-            measure(m, w, j, last, kinds, objects, rotations, translations, covariances, rate, decisions, nis)
+            restarts, tracked = m.counters[RESTARTS] + m.counters[REPLACED], m.counters[MODE] == TRACKING
+            last = end_of_stamp(stamps, j, len(stamps))
+            advance(m, w, imu_stamps, log.imu_values, stamps[j])
+            find_rate(m, w, imu_stamps, log.imu_values)
+            measure(m, w, log, j, last)
             cursor[NEXT] = last
             if m.counters[MODE] != TRACKING:
                 continue
-            _write_row(m, cursor, out_stamps, out_core, out_sigma, out_covariance)
+            _write_row(m, cursor, rows)
             for i in range(j, last):
-                fitted = fitted_rotations[i], fitted_covariances[i]
-                _keep_fitted(m, w, kinds[i], objects[i], rotations[i], covariances[i], rate, fitted[0], fitted[1])
+                read_fitted(m, w, log, i)
+                fitted_rotations[i], fitted_covariances[i] = w.measured[0:9], w.R
             jumped = _find_fresh(m, fresh)
             if not tracked or m.counters[RESTARTS] + m.counters[REPLACED] != restarts:
                 cursor[KEYFRAME_NS] = m.counters[NOW]
                 return STARTED
-            if jumped or kinds[j] == ODOMETRY_STEP or m.counters[NOW] - cursor[KEYFRAME_NS] >= spacing_ns:
+            if jumped or log.kinds[j] == ODOMETRY_STEP or m.counters[NOW] - cursor[KEYFRAME_NS] >= spacing_ns:
                 cursor[KEYFRAME_NS] = m.counters[NOW]
                 return KEYFRAME
             continue
-        advance(m, w, imu_stamps, imu_values, imu_stamps[k])
+        advance(m, w, imu_stamps, log.imu_values, imu_stamps[k])
         cursor[IMU_ROW] += 1
         if m.counters[MODE] == TRACKING:
-            if cursor[ROWS] == 0 or out_stamps[cursor[ROWS] - 1] != m.counters[NOW]:
-                _write_row(m, cursor, out_stamps, out_core, out_sigma, out_covariance)
+            if cursor[ROWS] == 0 or rows.stamps[cursor[ROWS] - 1] != m.counters[NOW]:
+                _write_row(m, cursor, rows)
             if m.counters[NOW] - cursor[KEYFRAME_NS] >= idle_ns:
                 cursor[KEYFRAME_NS] = m.counters[NOW]
                 return KEYFRAME
@@ -108,55 +95,15 @@ def filter_until_keyframe(
 
 
 @njit(cache=True)
-def _write_row(
-    m: Memory, cursor: Ints, out_stamps: Ints, out_core: Array, out_sigma: Array, out_covariance: Array
-) -> None:
-    emit(m, cursor[ROWS], out_stamps, out_core, out_sigma, out_covariance)
+def _write_row(m: Memory, cursor: Ints, rows: Rows) -> None:
+    emit(m, rows, cursor[ROWS])
     cursor[ROWS] += 1
 
 
 @njit(cache=True)
-def rewrite_row(
-    floats: Array,
-    integers: Ints,
-    cursor: Ints,
-    out_stamps: Ints,
-    out_core: Array,
-    out_sigma: Array,
-    out_covariance: Array,
-) -> None:
+def rewrite_row(floats: Array, integers: Ints, cursor: Ints, rows: Rows) -> None:
     """Write the newest row again, after the graph has corrected the filter's state."""
-    emit(views(floats, integers), cursor[ROWS] - 1, out_stamps, out_core, out_sigma, out_covariance)
-
-
-@njit(cache=True)
-def _keep_fitted(
-    m: Memory,
-    w: Work,
-    kind: int,
-    k: int,
-    rotation: Array,
-    covariance: Array,
-    rate: Array,
-    fitted_rotation: Array,
-    fitted_covariance: Array,
-) -> None:
-    """Write a measurement's rotation and covariance as the filter uses them."""
-    fitted_rotation[:] = rotation
-    w.R[:, :] = (m.scales[k] if kind == OBJECT_POSE else 1.0) * covariance
-    if kind == OBJECT_POSE and m.orders[k] != 1:
-        _fit_to_state(m, w, k, fitted_rotation, rate)
-    fitted_covariance[:, :] = w.R
-
-
-@njit(cache=True)
-def _fit_to_state(m: Memory, w: Work, k: int, R_m: Array, rate: Array) -> None:
-    """Turn a symmetric object's measured rotation to where it fits the state, with its noise in w.R."""
-    R_wi, R_wc, p_wi, R_co = w.step[0:9], w.step[9:18], w.step[18:21], w.step[30:39]
-    camera_in_world(m.x, m.x[TIME_OFFSET], rate, R_wi, p_wi, R_wc, w.step[21:30])
-    at = OBJECTS + OBJECT_SIZE * k
-    multiply_transposed_left(R_wc, m.x[at : at + 9], R_co)
-    fit_symmetry(R_m, R_co, m.axes[k], m.orders[k], w.R, w.scratch)
+    emit(views(floats, integers), rows, cursor[ROWS] - 1)
 
 
 @njit(cache=True)
@@ -201,7 +148,7 @@ class Walk:
         self.problem = problem
         self.floats, self.integers = fill_memory(problem, options)
         self.memory = memory.views.py_func(self.floats, self.integers)
-        self.columns = loop_columns(problem)
+        self.columns, self.out = loop_columns(problem)
         count = len(problem.measurements)
         self.rotations, self.covariances = np.zeros((count, 9)), np.zeros((count, 6, 6))
         self.cursor = np.zeros(CURSOR_SIZE, dtype=np.int64)
@@ -213,8 +160,8 @@ class Walk:
     @property
     def rows(self) -> tuple[Ints, Array, Array, Array]:
         """What was written so far: stamps, core, sigmas, covariances."""
-        n, c = self.cursor[ROWS], self.columns
-        return c.out_stamps[:n], c.out_core[:n], c.out_sigma[:n], c.out_covariance[:n].reshape(-1, 6, 6)
+        n, out = self.cursor[ROWS], self.out
+        return out.stamps[:n], out.core[:n], out.sigma[:n], out.covariance[:n].reshape(-1, 6, 6)
 
     def keyframes(self) -> Iterator[Keyframe]:
         """Yield the keyframes of the whole log, the last one at its end."""
@@ -240,11 +187,11 @@ class Walk:
             cursor,
             self._spacing_ns,
             self._idle_ns,
-            *c[:8],
+            c,
             self.rotations,
             self.covariances,
             self.fresh,
-            *c[8:],
+            self.out,
         )
         stamp, last = int(self.memory.counters[NOW]), int(cursor[NEXT])
         if event == END:
@@ -258,6 +205,4 @@ class Walk:
 
     def rewrite(self) -> None:
         """Write the newest row again after a correction of the memory."""
-        c = self.columns
-        out = (c.out_stamps, c.out_core, c.out_sigma, c.out_covariance)
-        rewrite_row(self.floats, self.integers, self.cursor, *out)
+        rewrite_row(self.floats, self.integers, self.cursor, self.out)

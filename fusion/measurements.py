@@ -141,6 +141,23 @@ def camera_in_world(
 
 
 @njit(cache=True)
+def object_in_world(
+    x: Array, seconds: float, angular_velocity: Array, R_m: Array, t_m: Array, T_wo: Array, work: Array
+) -> None:
+    """Write where a detection, `seconds` after the state, shows its object: R_world_obj (9), p_world_obj (3).
+
+    Leaves R_world_cam in work[9:18].
+    """
+    R_wi, R_wc, p_wi, lever, away = work[0:9], work[9:18], work[18:21], work[30:33], work[33:36]
+    camera_in_world(x, seconds, angular_velocity, R_wi, p_wi, R_wc, work[21:30])
+    multiply(R_wc, R_m, T_wo)
+    apply(R_wi, x[EXTRINSIC_POSITION], x[EXTRINSIC_POSITION + 1], x[EXTRINSIC_POSITION + 2], lever)
+    apply(R_wc, t_m[0], t_m[1], t_m[2], away)
+    for i in range(3):
+        T_wo[9 + i] = p_wi[i] + lever[i] + away[i]
+
+
+@njit(cache=True)
 def residual_and_jacobian(
     kind: int,
     k: int,

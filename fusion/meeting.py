@@ -9,12 +9,12 @@ from __future__ import annotations
 
 import math
 
+from fusion.columns import Columns
 from fusion.compiled import njit
 from fusion.consensus import MAX_TILT
-from fusion.eskf import fit_symmetry
-from fusion.measurements import OBJECT_POSE, camera_in_world
+from fusion.measurements import OBJECT_POSE, object_in_world
 from fusion.memory import ANCHOR, NOW, SUPPOSED, Memory, Work
-from fusion.nav_state import EXTRINSIC_POSITION, OBJECT_SIZE, OBJECTS, POSITION, TIME_OFFSET, Array, Ints
+from fusion.nav_state import OBJECT_SIZE, OBJECTS, POSITION, TIME_OFFSET, Array, Ints
 from fusion.so3_kernels import (
     apply,
     exp_so3,
@@ -24,6 +24,7 @@ from fusion.so3_kernels import (
     multiply_transposed_right,
     orthonormalise,
 )
+from fusion.symmetry import fit_symmetry
 
 # Places in the options.
 UNKNOWN_MAP, MIN_POSES, MIN_SPAN_S, LEAD, MAX_ANGLE, MAX_DISTANCE, MAX_LEVER, REPLACE = range(8)
@@ -48,17 +49,17 @@ def choose_anchor(m: Memory, kinds: Ints, objects: Ints, first: int, last: int) 
 
 
 @njit(cache=True)
-def suppose(m: Memory, w: Work, k: int, rotation: Array, translation: Array, rate: Array, offset: float) -> int:
-    """Take a detection into the hypotheses of an object's pose.
+def suppose(m: Memory, w: Work, log: Columns, j: int) -> int:
+    """Take detection j into the hypotheses of its object's pose.
 
-    rate (3,) and offset: unbiased angular velocity, and time offset (s) of the stamp, as in `residual_and_jacobian`.
     Returns PUT where the object is to be put where this detection sees it; START_AGAIN where it is the object that
     anchors the world, and the world is to be moved as w.step[96:117] then says (`consensus`); else WAIT.
     """
+    k, translation = log.objects[j], log.translations[j]
     if len(m.supposed) == 0 or (m.known[k] > 0.0 and m.meeting[REPLACE] == 0.0):
         return WAIT
     T = w.step[60:72]
-    _seen_pose(m, w, rotation, translation, rate, offset, T)
+    object_in_world(m.x, m.x[TIME_OFFSET] - w.offset[0], w.rate, log.rotations[j], translation, T, w.step)
     if m.known[k] > 0.0:
         _hold(m, k)
     away = math.sqrt(translation[0] ** 2 + translation[1] ** 2 + translation[2] ** 2)
@@ -110,18 +111,6 @@ def _world_turn(m: Memory, w: Work, T: Array) -> bool:
     for i in range(9):  # no velocity to add, nothing taken off
         w.step[108 + i] = 0.0
     return True
-
-
-@njit(cache=True)
-def _seen_pose(m: Memory, w: Work, rotation: Array, translation: Array, rate: Array, offset: float, T: Array) -> None:
-    """Write T_world_obj (12,) as a detection shows it."""
-    R_wi, R_wc, p_wi, arm = w.step[0:9], w.step[9:18], w.step[18:21], w.step[30:33]
-    camera_in_world(m.x, m.x[TIME_OFFSET] - offset, rate, R_wi, p_wi, R_wc, w.step[21:30])
-    multiply(R_wc, rotation, T)
-    apply(R_wi, m.x[EXTRINSIC_POSITION], m.x[EXTRINSIC_POSITION + 1], m.x[EXTRINSIC_POSITION + 2], arm)
-    apply(R_wc, translation[0], translation[1], translation[2], w.step[33:36])
-    for i in range(3):
-        T[9 + i] = p_wi[i] + arm[i] + w.step[33 + i]
 
 
 @njit(cache=True)

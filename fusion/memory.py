@@ -96,7 +96,7 @@ class Memory(NamedTuple):
     supposed: Array  # (K, SUPPOSED, .) where an object of unknown pose may be: places in meeting.py; or (0, ..)
     up: Array  # (3,) running mean of the specific force in the axes of the integrated motion
     noise: Array  # of the motion: places in imu.py and odometry.py
-    limits: Array  # places: filter_loop.LIMIT_BOTH and following
+    limits: Array  # places: filter_update.LIMIT_BOTH and following
     start: Array
     bias_model: Array
     moved: Array  # when an object counts as moved: places in place_watch.py
@@ -134,7 +134,7 @@ def allocate(layout: StateLayout) -> tuple[Array, Ints]:
         (AT_NOISE, 12),
         (AT_LIMITS, 12),
         (AT_START, 20),
-        (AT_BIAS_MODEL, 14),
+        (AT_BIAS_MODEL, 12),
         (AT_MOVED, 12),
         (AT_MEETING, 8),
         (AT_AXES, 3 * max(K, 1)),
@@ -171,24 +171,7 @@ def allocate(layout: StateLayout) -> tuple[Array, Ints]:
 def work_size(n: int) -> int:
     """Return how many floats of work space a filter with n error states needs."""
     return (
-        256
-        + 45
-        + 6
-        + 17 * CORE
-        + 3 * n
-        + 6
-        + 6 * MAX_COLUMNS
-        + 6 * n
-        + 36
-        + 36
-        + 36
-        + 6
-        + 6 * n
-        + n
-        + 12
-        + 128
-        + 6 * n
-        + 36
+        256 + 45 + 6 + 17 * CORE + 3 * n + 6 + 6 * MAX_COLUMNS + 6 * n + 36 + 36 + 36 + 6 + 6 * n + n + 12 + 128 + 3 + 1
     )
 
 
@@ -211,7 +194,7 @@ def views(floats: Array, integers: Ints) -> Memory:
         f[i[AT_NOISE] : i[AT_NOISE] + 12],
         f[i[AT_LIMITS] : i[AT_LIMITS] + 12],
         f[i[AT_START] : i[AT_START] + 20],
-        f[i[AT_BIAS_MODEL] : i[AT_BIAS_MODEL] + 14],
+        f[i[AT_BIAS_MODEL] : i[AT_BIAS_MODEL] + 12],
         f[i[AT_MOVED] : i[AT_MOVED] + 12],
         f[i[AT_MEETING] : i[AT_MEETING] + 8],
         f[i[AT_AXES] : i[AT_AXES] + 3 * K].reshape((K, 3)),
@@ -248,7 +231,8 @@ class Work(NamedTuple):
     error: Array
     measured: Array  # R_m (9), t_m (3)
     scratch: Array
-    objects: Array  # (6 n + 36,)
+    rate: Array  # (3,) unbiased angular velocity at the measurements' stamp, rad/s
+    offset: Array  # (1,) by how much later than their stamp says measurements are taken in, s
 
 
 @njit(cache=True, _nrt=True)
@@ -286,5 +270,6 @@ def work_views(work: Array, n: int) -> Work:
         work[q:r],
         work[r:s],
         work[s : s + 128],
-        work[s + 128 :],
+        work[s + 128 : s + 131],
+        work[s + 131 : s + 132],
     )

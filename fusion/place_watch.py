@@ -9,27 +9,14 @@ from __future__ import annotations
 
 import math
 
+from fusion.columns import Columns, read_fitted
 from fusion.compiled import njit
-from fusion.eskf import ACCEPTED, POSITION_ONLY, ROTATION_ONLY, bias_sigma, cholesky, fit_symmetry, whiten
-from fusion.measurements import OBJECT_POSE, camera_in_world, write_bias_axes
+from fusion.eskf import ACCEPTED, POSITION_ONLY, ROTATION_ONLY, cholesky, whiten
+from fusion.measurements import OBJECT_POSE, object_in_world, write_bias_axes
 from fusion.memory import NOW, Memory, Work
-from fusion.nav_state import (
-    AT_OBJECTS,
-    EXTRINSIC_POSITION,
-    N_BIAS_KINDS,
-    OBJECT_SIZE,
-    OBJECTS,
-    TIME_OFFSET,
-    Array,
-)
-from fusion.so3_kernels import (
-    apply,
-    apply_transposed,
-    log_so3,
-    multiply,
-    multiply_transposed_left,
-    multiply_transposed_right,
-)
+from fusion.nav_state import AT_OBJECTS, N_BIAS_KINDS, OBJECT_SIZE, OBJECTS, TIME_OFFSET, Array
+from fusion.object_biases import bias_sigma
+from fusion.so3_kernels import apply_transposed, log_so3, multiply_transposed_right
 
 RELEASED = 4  # beside the bits of the gate: the object is off the map, or turned and its rotation is not used
 
@@ -96,19 +83,17 @@ def return_to_map(m: Memory, k: int) -> None:
 
 
 @njit(cache=True)
-def watch(
-    m: Memory, w: Work, k: int, rotation: Array, translation: Array, covariance: Array, rate: Array, offset: float
-) -> int:
-    """Take a detection into an object's mean deviation from the map.
+def watch(m: Memory, w: Work, log: Columns, j: int) -> int:
+    """Take detection j into its object's mean deviation from the map.
 
-    rate (3,) and offset: unbiased angular velocity, and time offset (s) of the stamp, as in `residual_and_jacobian`.
     Returns 1 where the object, or its rotation, is released by it, -1 where it returns to the map, else 0.
     """
-    place, o = m.places[k], m.moved
+    k, o = log.objects[j], m.moved
+    place = m.places[k]
     elapsed = min((m.counters[NOW] - place[WATCHED_AT]) * 1e-9, o[MEMORY_S]) if place[COUNT] > 0.0 else 0.0
     place[WATCHED_AT] = m.counters[NOW]
     deviation = w.step[60:66]
-    _deviate(m, w, k, rotation, translation, covariance, rate, offset, deviation)
+    _deviate(m, w, log, j, deviation)
     if _far(place, deviation, 0) > 2.0 * o[ANGLE] or _far(place, deviation, 3) > 2.0 * o[DISTANCE]:
         for i in range(COUNT + 1):  # it shows elsewhere now
             place[i] = 0.0
@@ -151,40 +136,16 @@ def _look_anew(place: Array, status: int) -> None:
 
 
 @njit(cache=True)
-def _deviate(
-    m: Memory,
-    w: Work,
-    k: int,
-    rotation: Array,
-    translation: Array,
-    covariance: Array,
-    rate: Array,
-    offset: float,
-    out: Array,
-) -> None:
-    """Write a detection's deviation from the map (6,); leave its covariance in w.R, R_wc and p_co in w.step."""
-    R_wi, R_wc, p_wi, R_m = w.step[0:9], w.step[9:18], w.step[18:21], w.measured[0:9]
-    p_co, R_mo, arm = w.step[30:33], w.step[33:42], w.step[42:45]
-    for i in range(9):
-        R_m[i] = rotation[i]
-    for i in range(6):
-        for j in range(6):
-            w.R[i, j] = covariance[i, j] * m.scales[k]
-    camera_in_world(m.x, m.x[TIME_OFFSET] - offset, rate, R_wi, p_wi, R_wc, w.step[21:30])
-    at = OBJECTS + OBJECT_SIZE * k
-    R_wo = m.x[at : at + 9]
-    if m.orders[k] != 1:
-        multiply_transposed_left(R_wc, R_wo, w.step[33:42])
-        fit_symmetry(R_m, w.step[33:42], m.axes[k], m.orders[k], w.R, w.scratch)
-    multiply(R_wc, R_m, R_mo)
-    multiply_transposed_right(R_mo, R_wo, w.step[45:54])
+def _deviate(m: Memory, w: Work, log: Columns, j: int, out: Array) -> None:
+    """Write detection j's deviation from the map (6,); leave it in w.measured, w.R, and R_wc in w.step."""
+    read_fitted(m, w, log, j)
+    T_wo, at = w.step[66:78], OBJECTS + OBJECT_SIZE * log.objects[j]
+    seconds = m.x[TIME_OFFSET] - w.offset[0]
+    object_in_world(m.x, seconds, w.rate, w.measured[0:9], w.measured[9:12], T_wo, w.step)
+    multiply_transposed_right(T_wo, m.x[at : at + 9], w.step[45:54])
     log_so3(w.step[45:54], out)
-    apply(R_wi, m.x[EXTRINSIC_POSITION], m.x[EXTRINSIC_POSITION + 1], m.x[EXTRINSIC_POSITION + 2], arm)
-    apply(R_wc, translation[0], translation[1], translation[2], p_co)
     for i in range(3):
-        out[3 + i] = p_wi[i] + arm[i] + p_co[i] - m.x[at + 9 + i]
-    for i in range(3):
-        p_co[i] = translation[i]
+        out[3 + i] = T_wo[9 + i] - m.x[at + 9 + i]
 
 
 @njit(cache=True)
@@ -217,7 +178,7 @@ def _norm(place: Array, first: int) -> float:
 @njit(cache=True)
 def _implausible(m: Memory, w: Work, k: int, first: int) -> bool:
     """Tell whether the mean deviation in rotation (first 0) or position (3) is more than noise and biases explain."""
-    R_wc, p_co, axes = w.step[9:18], w.step[30:33], w.step[33:42]
+    R_wc, p_co, axes = w.step[9:18], w.measured[9:12], w.step[33:42]
     apply_transposed(
         R_wc, m.places[k, first], m.places[k, first + 1], m.places[k, first + 2], w.residual[first : first + 3]
     )

@@ -10,7 +10,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from fusion import consensus, eskf, filter_loop, imu, meeting, memory, odometry, place_watch
+from fusion import consensus, filter_update, imu, meeting, memory, object_biases, odometry, place_watch
 from fusion.measurements import CAMERA_POSE, OBJECT_POSE, Measurements, ray_aligned_covariance
 from fusion.motion_source import Kind, motion_source, odometry_steps
 from fusion.nav_state import ACCEL_BIAS_ERROR, CORE, GYRO_BIAS_ERROR, VELOCITY_ERROR, StateLayout, nominal_state
@@ -195,19 +195,9 @@ def fill_memory(problem: Problem, options: FuseOptions) -> tuple[Array, NDArray[
         options.gap.acceleration,
     )
     m.noise[imu.MEASURED] = options.imu.measured and problem.motion in WITH_IMU
-    m.limits[: filter_loop.SETTLED + 1] = _limits(options)
+    m.limits[: filter_update.SETTLED + 1] = _limits(options)
     m.start[: consensus.LEAD + 1] = _start(options)
-    bias = options.bias
-    m.bias_model[:] = 0.0
-    m.bias_model[eskf.BIAS_ROTATION] = math.radians(bias.rotation_deg)
-    m.bias_model[eskf.BIAS_ACROSS] = bias.across
-    m.bias_model[eskf.BIAS_ALONG] = bias.along
-    m.bias_model[eskf.BIAS_TAU] = bias.correlation_s
-    m.bias_model[eskf.BIAS_JUMP] = bias.jump
-    m.bias_model[eskf.BIAS_JUMP_AT] = bias.gross
-    steady = m.bias_model[eskf.BIAS_MODEL_SIZE :]
-    steady[eskf.BIAS_ROTATION] = math.radians(bias.steady_rotation_deg)
-    steady[[eskf.BIAS_ACROSS, eskf.BIAS_ALONG, eskf.BIAS_TAU]] = bias.steady_across, bias.steady_along, math.inf
+    m.bias_model[:] = _bias_model(options.bias)
     m.moved[: place_watch.MIN_POSES + 1] = _moved(options)
     m.meeting[: meeting.REPLACE + 1] = _meeting(options)
     m.prior[:] = _prior(layout, options)
@@ -269,12 +259,29 @@ def _limits(options: FuseOptions) -> list[float]:
         half,
         half,
         float(("none", "position", "both").index(gate.partial)),
-        0.0,
         gate.adaptation,
         gate.max_noise_scale,
         options.bias.jump_after,
         3.0 * gate.settled**2,
     ]
+
+
+def _bias_model(bias: DetectionBias) -> list[float]:
+    varying = {
+        object_biases.BIAS_ROTATION: math.radians(bias.rotation_deg),
+        object_biases.BIAS_ACROSS: bias.across,
+        object_biases.BIAS_ALONG: bias.along,
+        object_biases.BIAS_TAU: bias.correlation_s,
+        object_biases.BIAS_JUMP: bias.jump,
+        object_biases.BIAS_JUMP_AT: bias.gross,
+    }
+    steady = {
+        object_biases.BIAS_ROTATION: math.radians(bias.steady_rotation_deg),
+        object_biases.BIAS_ACROSS: bias.steady_across,
+        object_biases.BIAS_ALONG: bias.steady_along,
+        object_biases.BIAS_TAU: math.inf,
+    }
+    return [model.get(i, 0.0) for model in (varying, steady) for i in range(object_biases.BIAS_MODEL_SIZE)]
 
 
 def _start(options: FuseOptions) -> list[float]:

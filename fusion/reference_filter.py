@@ -13,18 +13,9 @@ import numpy as np
 from filterpy.kalman import predict, update
 from scipy.spatial.transform import Rotation
 
-from fusion import filter_loop, imu, memory, odometry, starting
-from fusion.eskf import (
-    ACCEPTED,
-    BIAS_JUMP,
-    BIAS_JUMP_AT,
-    BIAS_MODEL_SIZE,
-    BIAS_TAU,
-    POSITION_ONLY,
-    REJECTED,
-    ROTATION_ONLY,
-    bias_sigma,
-)
+from fusion import filter_loop, filter_motion, filter_update, imu, memory, odometry, starting
+from fusion.columns import OUT_CORE, OUT_SIGMA, Columns, Rows
+from fusion.eskf import ACCEPTED, POSITION_ONLY, REJECTED, ROTATION_ONLY
 from fusion.fuse import run_filter
 from fusion.measurements import OBJECT_POSE, ODOMETRY_STEP
 from fusion.meeting import PUT, UNKNOWN_MAP, choose_anchor
@@ -42,6 +33,7 @@ from fusion.nav_state import (
     put_pose,
     retract_state,
 )
+from fusion.object_biases import BIAS_JUMP, BIAS_JUMP_AT, BIAS_MODEL_SIZE, BIAS_TAU, bias_sigma
 from fusion.options import FuseOptions
 from fusion.place_watch import ON_MAP, RELEASED, TURNED, status_of
 from fusion.prepare import Problem
@@ -63,9 +55,6 @@ from fusion.reference_models import (
 )
 from fusion.result import FuseResult
 from poet_loc.core.geometry import make_pose
-
-Columns = tuple[Ints, Ints, Array, Array, Array]
-"""kinds (M,), objects (M,), rotations (M, 9), translations (M, 3), covariances (M, 6, 6)"""
 
 
 def run_reference(problem: Problem, options: FuseOptions) -> FuseResult:
@@ -111,7 +100,7 @@ class ReferenceFilter:
         m = self.m
         if not self.tracking:  # no covariance yet; the compiled step also keeps the mean specific force
             imu.propagate_nominal(m.x, dt, values[:3].copy(), values[3:6].copy(), self.work.step)
-            filter_loop._watch_gravity(m, self.work, dt)
+            filter_motion.watch_gravity(m, self.work, dt)
             return
         m.x[:], F = transition(m.x, dt, values[:3], values[3:6], self.layout)
         self.spread(F, process_noise(self.layout.n_error, dt, interval, m.noise, sample))
@@ -166,36 +155,35 @@ class ReferenceFilter:
         limits = self.m.limits
         for i, rows in enumerate((BOTH, ROTATION_ROWS, POSITION_ROWS)):
             nis[i] = residual[rows] @ np.linalg.solve(S[rows, rows], residual[rows])
-        if nis[0] <= limits[filter_loop.LIMIT_BOTH]:
+        if nis[0] <= limits[filter_update.LIMIT_BOTH]:
             return ACCEPTED
-        if limits[filter_loop.PARTIAL] >= 1 and nis[2] <= limits[filter_loop.LIMIT_POSITION]:
+        if limits[filter_update.PARTIAL] >= 1 and nis[2] <= limits[filter_update.LIMIT_POSITION]:
             return POSITION_ONLY
-        if limits[filter_loop.PARTIAL] >= 2 and nis[1] <= limits[filter_loop.LIMIT_ROTATION]:
+        if limits[filter_update.PARTIAL] >= 2 and nis[1] <= limits[filter_update.LIMIT_ROTATION]:
             return ROTATION_ONLY
         return REJECTED
 
-    def take(self, measured: Columns, j: int, rate: Array, nis: Array, correcting: bool = True) -> int:
+    def take(self, log: Columns, j: int, correcting: bool = True) -> int:
         """Gate measurement j, which is at the filter's stamp, correct with what passes, and return what that was."""
-        kinds, objects, rotations, translations, covariances = measured
-        kind, k, t_m = int(kinds[j]), int(objects[j]), translations[j]
-        m, R_m, R = self.m, rotations[j].reshape(3, 3), covariances[j]
+        kind, k, t_m, nis = int(log.kinds[j]), int(log.objects[j]), log.translations[j], log.nis[j]
+        m, R_m, R = self.m, log.rotations[j].reshape(3, 3), log.covariances[j]
         if kind == OBJECT_POSE:
             R = R * m.scales[k]
             if not m.known[k]:
                 nis[0] = np.inf
                 return REJECTED
             if m.orders[k] != 1:
-                R_m, R = self._fit_symmetry(k, R_m, R, rate)
-        offset = m.limits[filter_loop.NOMINAL_OFFSET]
+                R_m, R = self._fit_symmetry(k, R_m, R)
+        rate, offset = self.work.rate, self.work.offset[0]
         residual, H = residual_and_jacobian(kind, k, R_m, t_m, m.x, rate, offset, self.layout)
         decision, status = self.gate(residual, H @ m.P @ H.T + R, nis), status_of(m, kind, k)
         if not correcting:
             return decision
         if status != ON_MAP:
-            fits = status == TURNED and nis[2] <= m.limits[filter_loop.LIMIT_POSITION]
+            fits = status == TURNED and nis[2] <= m.limits[filter_update.LIMIT_POSITION]
             decision = POSITION_ONLY if fits else REJECTED
-        if kind == OBJECT_POSE and m.limits[filter_loop.ADAPTATION] > 0.0:
-            filter_loop._adapt_scale(m, k, nis[0])
+        if kind == OBJECT_POSE and m.limits[filter_update.ADAPTATION] > 0.0:
+            filter_update.adapt_scale(m, k, nis[0])
         if decision != REJECTED:
             rows = {ACCEPTED: BOTH, POSITION_ONLY: POSITION_ROWS, ROTATION_ONLY: ROTATION_ROWS}[decision]
             self.correct(residual[rows], H[rows], R[rows, rows])
@@ -215,19 +203,20 @@ class ReferenceFilter:
         m.x[start : start + 12] = m.x[:12]
         m.counters[memory.CLONED] = 1
 
-    def _put_object(self, k: int, R_m: Array, t_m: Array, R: Array, rate: Array) -> None:
-        """Put an object whose pose in the world is unknown where a detection sees it.
+    def _put_object(self, log: Columns, j: int) -> None:
+        """Put an object whose pose in the world is unknown where detection j sees it.
 
         With 0 = H_x dx + H_o do + e its error is do = -H_o^-1 (H_x dx + e).
         """
-        m, layout, x = self.m, self.layout, self.m.x
-        offset, at = m.limits[filter_loop.NOMINAL_OFFSET], OBJECTS + OBJECT_SIZE * k
+        m, layout, x, k = self.m, self.layout, self.m.x, int(log.objects[j])
+        R_m, t_m, R = log.rotations[j].reshape(3, 3), log.translations[j], log.covariances[j] * m.scales[k]
+        rate, offset, at = self.work.rate, self.work.offset[0], OBJECTS + OBJECT_SIZE * k
         T_world_imu = make_pose(
             Rotation.from_matrix(x[:9].reshape(3, 3) @ exp((x[TIME_OFFSET] - offset) * rate)),
             x[POSITION : POSITION + 3] + (x[TIME_OFFSET] - offset) * x[VELOCITY : VELOCITY + 3],
         )
         put_pose(x, at, T_world_imu * pose_at(x, EXTRINSIC_ROTATION) * make_pose(Rotation.from_matrix(R_m), t_m))
-        filter_loop._forget_biases(m, k, False)
+        filter_update.forget_biases(m, k, False)
         _, H = residual_and_jacobian(OBJECT_POSE, k, R_m, t_m, x, rate, offset, layout)
         rows = layout.error_slice("objects", k)
         inverse = np.linalg.inv(H[:, rows])
@@ -237,55 +226,54 @@ class ReferenceFilter:
         self.spread(A, Q)
         m.known[k] = 1.0
 
-    def _fit_symmetry(self, k: int, R_m: Array, R: Array, rate: Array) -> tuple[Array, Array]:
+    def _fit_symmetry(self, k: int, R_m: Array, R: Array) -> tuple[Array, Array]:
         """Turn a measured rotation to the look-alike that fits best; a continuous symmetry says nothing of its turn."""
         x, axis, order = self.m.x, self.m.axes[k], int(self.m.orders[k])
-        seconds = x[TIME_OFFSET] - self.m.limits[filter_loop.NOMINAL_OFFSET]
+        seconds = x[TIME_OFFSET] - self.work.offset[0]
         R_ic = x[EXTRINSIC_ROTATION : EXTRINSIC_ROTATION + 9].reshape(3, 3)
         at = OBJECTS + OBJECT_SIZE * k
-        R_co = (x[:9].reshape(3, 3) @ exp(seconds * rate) @ R_ic).T @ x[at : at + 9].reshape(3, 3)
+        R_co = (x[:9].reshape(3, 3) @ exp(seconds * self.work.rate) @ R_ic).T @ x[at : at + 9].reshape(3, 3)
         R_m = nearest_symmetric(R_m, R_co, axis, order)
         if order == 0:
             R = R.copy()
             R[:3, :3] += 1e3 * np.outer(R_m @ axis, R_m @ axis)
         return R_m, R
 
-    def order(self, first: int, last: int, measured: Columns, rate: Array, nis: Array) -> list[int]:
+    def order(self, first: int, last: int, log: Columns) -> list[int]:
         """Return the order in which a stamp is taken in: an unsure state hears the best fit first."""
         order = list(range(first, last))
-        if np.trace(self.m.P[POS, POS]) <= self.m.limits[filter_loop.SETTLED]:
+        if np.trace(self.m.P[POS, POS]) <= self.m.limits[filter_update.SETTLED]:
             return order
         for j in order:
-            self.take(measured, j, rate, nis[j], correcting=False)
-        return sorted(order, key=lambda j: float(nis[j, 0]))
+            self.take(log, j, correcting=False)
+        return sorted(order, key=lambda j: float(log.nis[j, 0]))
 
-    def measure(self, first: int, last: int, measured: Columns, rate: Array, decisions: Ints, nis: Array) -> None:
+    def measure(self, log: Columns, first: int, last: int) -> None:
         """Take in all measurements of one stamp, then see whether to start or to start again."""
-        m, kinds, c = self.m, measured[0], self.m.counters
+        m, kinds, decisions, c = self.m, log.kinds, log.decisions, self.m.counters
         decisions[first:last] = REJECTED
         first, odometry = first + int(np.count_nonzero(kinds[first:last] == ODOMETRY_STEP)), first
         if self.tracking:
             self.decay_biases()
             for j in range(odometry, first if c[memory.CLONED] else odometry):
-                decisions[j] = self.take(measured, j, rate, nis[j])
+                decisions[j] = self.take(log, j)
         if odometry < first == last:
             if self.tracking:
                 self.clone()
             return
         if m.meeting[UNKNOWN_MAP]:
-            choose_anchor(m, kinds, measured[1], first, last)
+            choose_anchor(m, kinds, log.objects, first, last)
         if self.tracking:
-            for j in self.order(first, last, measured, rate, nis):
-                decisions[j] = self.take(measured, j, rate, nis[j])
+            for j in self.order(first, last, log):
+                decisions[j] = self.take(log, j)
             for j in range(first, last if (decisions[first:last] & ACCEPTED).any() else first):
                 if decisions[j] == REJECTED:  # refused before the others had moved the state: ask again
-                    decisions[j] = self.take(measured, j, rate, nis[j])
+                    decisions[j] = self.take(log, j)
             for j in range(first, last if len(m.supposed) else first):
-                k, R_m, t_m = measured[1][j], measured[2][j], measured[3][j]
-                if kinds[j] == OBJECT_POSE and filter_loop.meet(m, self.work, k, R_m, t_m, rate) == PUT:
-                    self._put_object(k, R_m.reshape(3, 3), t_m, measured[4][j] * m.scales[k], rate)
+                if kinds[j] == OBJECT_POSE and filter_loop.meet(m, self.work, log, j) == PUT:
+                    self._put_object(log, j)
                     decisions[j] = ACCEPTED
-        filter_loop.account(m, self.work, first, last, *measured, rate, decisions, nis)
+        filter_loop.account(m, self.work, log, first, last)
         if self.tracking:
             starting.restart_if_lost(m, self.work)
         else:
@@ -294,29 +282,12 @@ class ReferenceFilter:
             self.clone()
 
 
-def run_log(
-    floats: Array,
-    integers: Ints,
-    imu_stamps: Ints,
-    imu_values: Array,
-    stamps: Ints,
-    kinds: Ints,
-    objects: Ints,
-    rotations: Array,
-    translations: Array,
-    covariances: Array,
-    decisions: Ints,
-    nis: Array,
-    out_stamps: Ints,
-    out_core: Array,
-    out_sigma: Array,
-    out_covariance: Array,
-) -> int:
+def run_log(floats: Array, integers: Ints, log: Columns, rows: Rows) -> int:
     """Filter a whole log: `filter_loop.run_log` with the same arguments and the same rows."""
     f = ReferenceFilter(floats, integers)
-    measured = (kinds, objects, rotations, translations, covariances)
-    filter_loop.begin(f.m, imu_stamps[0], imu_values[0, 3:6].copy(), 0)
-    j, rows = int(np.searchsorted(stamps, imu_stamps[0])), 0
+    stamps, imu_stamps, imu_values = log.stamps, log.imu_stamps, log.imu_values
+    filter_motion.begin(f.m, imu_stamps[0], imu_values[0, 3:6].copy(), 0)
+    j, row, since = int(np.searchsorted(stamps, imu_stamps[0])), 0, imu_stamps - imu_stamps[0]
     for end in imu_stamps:
         due = -1
         while due <= end:
@@ -325,16 +296,16 @@ def run_log(
             f.advance(imu_stamps, imu_values, stamp)
             if due <= end:
                 last = int(np.searchsorted(stamps, stamps[j] + 1))
-                f.m.limits[filter_loop.NOMINAL_OFFSET] = (stamp - stamps[j]) * 1e-9
-                since = imu_stamps - imu_stamps[0]
                 gyro = [np.interp(stamp - imu_stamps[0], since, imu_values[:, i]) for i in range(3)]
-                f.measure(j, last, measured, np.array(gyro) - f.m.x[GYRO_BIAS : GYRO_BIAS + 3], decisions, nis)
+                f.work.rate[:] = np.array(gyro) - f.m.x[GYRO_BIAS : GYRO_BIAS + 3]
+                f.work.offset[0] = (stamp - stamps[j]) * 1e-9
+                f.measure(log, j, last)
                 f.m.counters[memory.LAST_STAMP] = stamps[j]
                 filter_loop.retime(f.m)
                 j = last
-            if f.tracking and (rows == 0 or out_stamps[rows - 1] != stamp):
-                out_stamps[rows], out_core[rows] = stamp, f.m.x[: filter_loop.OUT_CORE]
-                out_sigma[rows] = np.sqrt(np.diag(f.m.P)[: filter_loop.OUT_SIGMA].clip(min=0.0))
-                out_covariance[rows] = f.m.P[:6, :6].ravel()
-                rows += 1
-    return rows
+            if f.tracking and (row == 0 or rows.stamps[row - 1] != stamp):
+                rows.stamps[row], rows.core[row] = stamp, f.m.x[:OUT_CORE]
+                rows.sigma[row] = np.sqrt(np.diag(f.m.P)[:OUT_SIGMA].clip(min=0.0))
+                rows.covariance[row] = f.m.P[:6, :6].ravel()
+                row += 1
+    return row

@@ -10,8 +10,10 @@ from __future__ import annotations
 
 import math
 
+from fusion.columns import Columns
 from fusion.compiled import njit
-from fusion.filter_loop import advance, begin, due, measure_at
+from fusion.filter_loop import due, end_of_stamp, measure_at
+from fusion.filter_motion import advance, begin
 from fusion.imu_noise import REACH, follow_noise
 from fusion.memory import (
     IMU_AT,
@@ -313,13 +315,10 @@ def _measure_until(m: Memory, w: Work, r: Ring, until: int) -> None:
     """Take in the waiting measurements up to a stamp that the IMU has reached."""
     h = r.header
     while h[NEXT] < h[COUNT] and due(m, r.stamps[h[NEXT]]) <= until:
-        first, last, stamp = h[NEXT], h[NEXT], r.stamps[h[NEXT]]
-        while last < h[COUNT] and r.stamps[last] == stamp:
-            vote = m.counters[VOTE_HEAD] + last - first
+        last = end_of_stamp(r.stamps, h[NEXT], h[COUNT])
+        for vote in range(m.counters[VOTE_HEAD], m.counters[VOTE_HEAD] + last - h[NEXT]):
             place, slot = vote % h[CAPACITY], vote % VOTES
             r.overwritten[place] = m.votes[slot]
             r.overwritten_stamps[place] = m.vote_stamps[slot]
-            last += 1
-        columns = (r.stamps, r.kinds, r.objects, r.rotations, r.translations, r.covariances)
-        measure_at(m, w, first, last, *columns, r.imu_stamps, r.imu_values, r.rate, r.decisions, r.nis)
-        h[NEXT] = last
+        measured = (r.stamps, r.kinds, r.objects, r.rotations, r.translations, r.covariances, r.decisions, r.nis)
+        h[NEXT] = measure_at(m, w, Columns(r.imu_stamps, r.imu_values, *measured), h[NEXT], last)

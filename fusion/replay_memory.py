@@ -61,7 +61,6 @@ class Ring(NamedTuple):
     overwritten: Array  # (capacity, VOTE_SIZE) what vote number i (modulo capacity) took the place of
     overwritten_stamps: Ints
     sample: Array  # (6,) incoming IMU sample
-    rate: Array  # (3,) angular velocity at a measurement
     new_kinds: Ints  # (BATCH,) incoming measurements
     new_objects: Ints
     new_rotations: Array  # (BATCH, 9), a quaternion (scalar last) in the first four places
@@ -75,7 +74,7 @@ def allocate_ring(
     """Return the zeroed arrays beside a filled filter memory, whose state is kept as the one to begin from."""
     state_size, snapshots = int(integers[END_OF_STATE]), horizon_ns // interval_ns + 3
     float_size = SAMPLE_SIZE * imu_capacity + 51 * capacity + snapshots * (state_size + VOTES) + state_size
-    float_size += VOTE_SIZE * capacity + 9 + 48 * BATCH
+    float_size += VOTE_SIZE * capacity + 6 + 48 * BATCH
     integer_size = RING_HEADER + imu_capacity + 5 * capacity + snapshots * N_COUNTERS + 2 * BATCH
     ring_floats, ring_integers = np.zeros(float_size), np.zeros(integer_size, dtype=np.int64)
     ring_integers[[IMU_CAPACITY, CAPACITY, SNAPSHOTS, STATE_SIZE]] = imu_capacity, capacity, snapshots, state_size
@@ -97,7 +96,7 @@ def ring_views(f: Array, i: Ints) -> Ring:
     h = g + s * VOTES
     k = h + size
     m = k + VOTE_SIZE * cm
-    n = m + 9
+    n = m + 6
     o = n + 9 * BATCH
     p = o + 3 * BATCH
     j = RING_HEADER + ci
@@ -122,7 +121,6 @@ def ring_views(f: Array, i: Ints) -> Ring:
         f[k:m].reshape((cm, VOTE_SIZE)),
         i[j + 4 * cm : q],
         f[m : m + 6],
-        f[m + 6 : n],
         i[r : r + BATCH],
         i[r + BATCH : r + 2 * BATCH],
         f[n:o].reshape((BATCH, 9)),

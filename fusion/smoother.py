@@ -15,7 +15,8 @@ from numpy.typing import NDArray
 
 from fusion import filter_loop, memory, tape
 from fusion.calibrated import calibrated
-from fusion.fuse import LoopColumns, gate_log, loop_columns, never_started, result_from_rows
+from fusion.columns import OUT_CORE, Columns, Rows
+from fusion.fuse import gate_log, loop_columns, never_started, result_from_rows
 from fusion.nav_state import CORE, StateLayout
 from fusion.options import FuseOptions
 from fusion.prepare import Problem, fill_memory
@@ -47,14 +48,14 @@ def run_smoother(problem: Problem, options: FuseOptions) -> FuseResult:
     """
     began = time.perf_counter()
     floats, integers = fill_memory(problem, options)
-    columns, core, covariance = smooth(problem, floats, integers)
+    columns, rows, core, covariance = smooth(problem, floats, integers)
     if len(core) == 0:
         raise never_started(problem, options)
     m = memory.views.py_func(floats, integers)
     sigma = np.sqrt(np.diagonal(covariance, axis1=1, axis2=2).clip(min=0.0))
     result = result_from_rows(
         f"fuse/eskf-smoothed/{options.measurements}",
-        (columns.out_stamps[: len(core)], core, sigma, np.ascontiguousarray(covariance[:, :6, :6])),
+        (rows.stamps[: len(core)], core, sigma, np.ascontiguousarray(covariance[:, :6, :6])),
         gate_log(problem, columns.decisions, columns.nis),
         time.perf_counter() - began,
         int(m.counters[memory.RESTARTS]),
@@ -62,31 +63,32 @@ def run_smoother(problem: Problem, options: FuseOptions) -> FuseResult:
     return replace(result, motion=problem.motion, body=problem.body, calibrated=calibrated(m, problem))
 
 
-def smooth(problem: Problem, floats: Array, integers: Stamps) -> tuple[LoopColumns, Array, Array]:
+def smooth(problem: Problem, floats: Array, integers: Stamps) -> tuple[Columns, Rows, Array, Array]:
     """Run a filled memory over the log and back.
 
-    Returns the filter's columns and, per row, the smoothed core of the state (N, 21) and its covariance (N, 15, 15).
+    Returns the filter's columns and rows and, per row, the smoothed core (N, 21) and its covariance (N, 15, 15).
     """
-    columns, samples = loop_columns(problem), len(problem.imu)
+    (columns, rows), samples = loop_columns(problem), len(problem.imu)
     kept, measurement, row = [], 0, 0
     for first in range(0, samples, STRETCH):
         kept.append(_Kept(floats.copy(), integers.copy(), first, measurement, row))
         end = min(first + STRETCH, samples)
-        measurement, row = filter_loop.run_part(floats, integers, *columns, first, end, measurement, row)
+        measurement, row = filter_loop.run_part(floats, integers, columns, rows, first, end, measurement, row)
     n = problem.layout.n_error
-    core, covariance = np.empty((row, filter_loop.OUT_CORE)), np.empty((row, CORE, CORE))
+    core, covariance = np.empty((row, OUT_CORE)), np.empty((row, CORE, CORE))
     gradient, information = np.zeros(n), np.zeros((n, n))
     stop = samples, measurement
     for start in reversed(kept):
-        _go_back(start, stop, columns, gradient, information, core, covariance)
+        _go_back(start, stop, columns, rows, gradient, information, core, covariance)
         stop = start.first, start.measurement
-    return columns, core, covariance
+    return columns, rows, core, covariance
 
 
 def _go_back(
     start: _Kept,
     end: tuple[int, int],
-    columns: LoopColumns,
+    columns: Columns,
+    rows: Rows,
     gradient: Array,
     information: Array,
     core: Array,
@@ -98,7 +100,7 @@ def _go_back(
     stamps = len(np.unique(columns.stamps[start.measurement : end[1]]))
     size = tape.tape_bound(layout, samples, stamps, measurements)
     floats, integers = tape.with_tape(start.floats, start.integers, size)
-    filter_loop.run_part(floats, integers, *columns, start.first, end[0], start.measurement, start.row)
+    filter_loop.run_part(floats, integers, columns, rows, start.first, end[0], start.measurement, start.row)
     m = memory.views.py_func(floats, integers)
     core_layout = StateLayout().as_integers()
     unroll(m.tape, m.counters[memory.TAPE_END], layout, core_layout, gradient, information, core, covariance)

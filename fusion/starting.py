@@ -21,10 +21,7 @@ from fusion.consensus import (
     largest_agreement,
     objects_seen,
 )
-from fusion.eskf import (
-    POSITION_ONLY,
-    bias_sigma,
-)
+from fusion.eskf import POSITION_ONLY
 from fusion.measurements import OBJECT_POSE
 from fusion.meeting import forget_rivals
 from fusion.memory import (
@@ -56,6 +53,7 @@ from fusion.nav_state import (
     VELOCITY,
     Array,
 )
+from fusion.object_biases import bias_sigma
 from fusion.place_watch import ON_MAP, forget_places, status_of
 from fusion.so3_kernels import (
     apply,

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from fusion.simulation_options import Displacement
 from poet_loc.core.geometry import make_pose, retract
 from poet_loc.core.records import Landmark, LandmarkMap, Symmetry
 
@@ -39,6 +42,19 @@ def _spread(count: int, rng: np.random.Generator) -> Array:
         room = np.linalg.norm(draws[:, None] - places, axis=2).min(axis=1, initial=np.inf)
         places = np.vstack([places, draws[np.argmax(room)]])
     return places
+
+
+def displaced_map(landmark_map: LandmarkMap, moved: Displacement, rng: np.random.Generator) -> LandmarkMap:
+    """Return the map with one object moved over the table and turned about the vertical."""
+    angle, landmarks = rng.uniform(-np.pi, np.pi), list(landmark_map)
+    if not 0 <= moved.object < len(landmarks):
+        return landmark_map
+    before = landmarks[moved.object]
+    turn = Rotation.from_rotvec([0.0, 0.0, np.radians(moved.turn_deg)])
+    aside = moved.distance * np.array([np.cos(angle), np.sin(angle), 0.0])
+    T_world_obj = make_pose(turn * before.T_world_obj.rotation, before.T_world_obj.translation + aside)
+    landmarks[moved.object] = replace(before, T_world_obj=T_world_obj)
+    return LandmarkMap(tuple(landmarks))
 
 
 def disturbed_map(

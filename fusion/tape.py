@@ -21,9 +21,8 @@ import math
 import numpy as np
 
 from fusion.compiled import njit
-from fusion.eskf import BIAS_MODEL_SIZE, BIAS_TAU, fades
 from fusion.measurements import MAX_COLUMNS
-from fusion.memory import AT_TAPE, TAPE_END, TAPE_SIZE, Memory, Work
+from fusion.memory import AT_TAPE, BIAS_TIME, NOW, TAPE_END, TAPE_SIZE, Memory, Work
 from fusion.nav_state import (
     AT_BIASES,
     AT_OBJECTS,
@@ -37,6 +36,7 @@ from fusion.nav_state import (
     Array,
     Ints,
 )
+from fusion.object_biases import BIAS_MODEL_SIZE, BIAS_TAU, fades
 from fusion.so3_kernels import multiply_transposed_left
 
 STEP, ODOMETRY, DECAY, CORRECTION, MEETING, FORGETTING, RESTART, ROW, CLONING = range(9)
@@ -92,8 +92,9 @@ def note_odometry(m: Memory, w: Work) -> None:
 
 
 @njit(cache=True)
-def note_decay(m: Memory, seconds: float) -> None:
-    """Write down what `eskf.decay_biases` is about to do."""
+def note_decay(m: Memory) -> None:
+    """Write down what `object_biases.decay_biases` is about to do."""
+    seconds = (m.counters[NOW] - m.counters[BIAS_TIME]) * 1e-9
     at, K = m.counters[TAPE_END], m.layout[N_OBJECTS]
     for kind in range(m.layout[N_BIAS_KINDS]):
         phi = math.exp(-seconds / m.bias_model[kind * BIAS_MODEL_SIZE + BIAS_TAU])
@@ -148,7 +149,7 @@ def note_correction(m: Memory, w: Work, first: int, size: int, count: int) -> No
 
 @njit(cache=True)
 def note_meeting(m: Memory, w: Work, k: int, count: int) -> None:
-    """Write down that object k was placed where its first detection saw it (`eskf.adopt_object`)."""
+    """Write down that object k was placed where its first detection saw it (`new_states.adopt_object`)."""
     tape, at, own = m.tape, m.counters[TAPE_END], m.layout[AT_OBJECTS] + 6 * k
     tape[at], tape[at + 1] = own, count
     at += 2
@@ -189,7 +190,7 @@ def note_restart(m: Memory, keep_from: int) -> None:
 
 @njit(cache=True)
 def note_clone(m: Memory) -> None:
-    """Write down that the clone became the pose of now (`eskf.clone_pose`)."""
+    """Write down that the clone became the pose of now (`new_states.clone_pose`)."""
     tape, x, at = m.tape, m.x, m.counters[TAPE_END]
     px, py, pz = x[POSITION], x[POSITION + 1], x[POSITION + 2]
     for i in range(9):

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from fusion import memory
-from fusion.imu_noise import imu_rows
+from fusion.fuse import loop_columns
 from fusion.nav_state import StateLayout
 from fusion.options import FuseOptions
 from fusion.prepare import Problem, fill_memory, pose_problem
@@ -58,13 +58,10 @@ def memory_of(problem: Problem, options: FuseOptions) -> tuple[np.ndarray, np.nd
 def run(loop: Callable[..., int], problem: Problem, options: FuseOptions) -> FilterRun:
     """Run `filter_loop.run_log` or its plain twin."""
     floats, integers = memory_of(problem, options)
-    measured, imu = problem.measurements, problem.imu
-    count, rows = len(measured), len(imu) + len(measured)
-    out = [np.zeros(count, np.int64), np.full((count, 3), np.nan), np.zeros(rows, np.int64)]
-    out += [np.zeros((rows, 21)), np.zeros((rows, 15)), np.zeros((rows, 36))]
-    columns = (measured.kinds, measured.objects, measured.rotations, measured.translations, measured.covariances)
-    written = loop(floats, integers, imu.stamps_ns, imu_rows(imu), measured.stamps_ns, *columns, *out)
-    return FilterRun(*out[:2], *(column[:written] for column in out[2:]), memory.views.py_func(floats, integers))
+    log, rows = loop_columns(problem)
+    written = loop(floats, integers, log, rows)
+    kept = (column[:written] for column in rows)
+    return FilterRun(log.decisions, log.nis, *kept, memory.views.py_func(floats, integers))
 
 
 def assert_same(one: FilterRun, other: FilterRun, tolerance: float = 1e-9) -> None:

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from fusion import eskf, imu, measurements
+from fusion import imu, measurements, new_states
 from fusion.nav_state import (
     TIME_OFFSET,
     StateLayout,
@@ -137,7 +137,7 @@ def test_a_clone_is_the_pose_with_its_error(layout):
         ahead, behind = (cloned(retract_state(x, sign * error, layout)) for sign in (1, -1))
         J[:, j] = (local_state(cloned(x), ahead, layout) - local_state(cloned(x), behind, layout)) / 2e-6
     after, spread = x.copy(), P.copy()
-    eskf.clone_pose(after, spread, layout.as_integers())
+    new_states.clone_pose(after, spread, layout.as_integers())
     np.testing.assert_array_equal(after, cloned(x))
     np.testing.assert_allclose(spread, J @ P @ J.T, atol=1e-6 * np.abs(P).max())
     np.testing.assert_array_equal(spread, spread.T)

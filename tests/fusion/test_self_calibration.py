@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import RigidTransform
 
-from fusion.fuse import fuse
-from fusion.imu_noise import imu_rows
+from fusion.filter_loop import run_log
+from fusion.fuse import fuse, loop_columns
 from fusion.memory import views
 from fusion.nav_state import EXTRINSIC_ROTATION, OBJECT_SIZE, OBJECTS, TIME_OFFSET, pose_at
 from fusion.options import DetectionBias, Estimate, FuseOptions
@@ -37,16 +37,9 @@ def errors_and_nees(result: FuseResult, log: Log) -> tuple[np.ndarray, float]:
 
 
 def final_state(log: Log, options: FuseOptions) -> np.ndarray:
-    from fusion import filter_loop
-
     problem = pose_problem(log, options)
     buffers = fill_memory(problem, options)
-    m, samples = problem.measurements, problem.imu
-    rows = len(m) + len(samples)
-    columns = (m.kinds, m.objects, m.rotations, m.translations, m.covariances)
-    outputs = (np.zeros(rows, np.int64), np.zeros((rows, 21)), np.zeros((rows, 15)), np.zeros((rows, 36)))
-    decisions, nis = np.zeros(len(m), np.int64), np.zeros((len(m), 3))
-    filter_loop.run_log(*buffers, samples.stamps_ns, imu_rows(samples), m.stamps_ns, *columns, decisions, nis, *outputs)
+    run_log(*buffers, *loop_columns(problem))
     return views.py_func(*buffers).x
 
 

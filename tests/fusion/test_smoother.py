@@ -93,7 +93,7 @@ def assert_smoothed_like_fixed_point(monkeypatch, problem, options, share):
     kept, plain = fixed_point(monkeypatch, problem, options, anchor)
     np.testing.assert_array_equal(plain.decisions, compiled.decisions)
 
-    core, covariance = smooth(problem, *memory_of(problem, options))[1:]
+    core, covariance = smooth(problem, *memory_of(problem, options))[2:]
     row = int(np.searchsorted(compiled.stamps, kept.stamp))
     np.testing.assert_allclose(kept.x[:EXTRINSIC_ROTATION], compiled.core[row], atol=1e-9)
     core_layout, error = StateLayout(), kept.error[:CORE]

@@ -1,0 +1,107 @@
+"""The filter at a measurement: gate it, take in what passes, put an object where it is seen, forget what jumped."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from fusion.columns import Columns, read, read_fitted
+from fusion.compiled import njit
+from fusion.eskf import ACCEPTED, POSITION_ONLY, REJECTED, ROTATION_ONLY, correct, gate, innovation
+from fusion.measurements import OBJECT_POSE, object_in_world, residual_and_jacobian
+from fusion.memory import MODE, TRACKING, Memory, Work
+from fusion.nav_state import N_BIAS_KINDS, N_OBJECTS, OBJECT_SIZE, OBJECTS, TIME_OFFSET
+from fusion.new_states import adopt_object
+from fusion.object_biases import forget_bias
+from fusion.place_watch import ON_MAP, RELEASED, TURNED, status_of
+from fusion.tape import note_correction, note_forgetting, note_meeting
+
+# Places in the limits.
+LIMIT_BOTH, LIMIT_ROTATION, LIMIT_POSITION, PARTIAL, ADAPTATION, MAX_SCALE, JUMP_AFTER, SETTLED = range(8)
+
+
+@njit(cache=True)
+def take(m: Memory, w: Work, log: Columns, j: int, correcting: bool) -> int:
+    """Gate measurement j and, where correcting, take in what passes; write its NIS, return what passed."""
+    kind, k, nis = log.kinds[j], log.objects[j], log.nis[j]
+    if kind == OBJECT_POSE and m.known[k] == 0.0:
+        nis[0] = np.inf
+        return REJECTED
+    read_fitted(m, w, log, j)
+    count = _predict(m, w, kind, k)
+    innovation(m, w, count)
+    decision, status = gate(w.S, w.residual, m.limits, m.limits[PARTIAL], w.L, w.white, nis), status_of(m, kind, k)
+    if not correcting:
+        return decision
+    if kind == OBJECT_POSE and m.limits[ADAPTATION] > 0.0:
+        adapt_scale(m, k, nis[0])
+    if status != ON_MAP:
+        decision = POSITION_ONLY if status == TURNED and nis[2] <= m.limits[LIMIT_POSITION] else REJECTED
+    if decision != REJECTED:
+        first, size = 3 if decision == POSITION_ONLY else 0, 6 if decision == ACCEPTED else 3
+        correct(m, w, first, size)
+        if len(m.tape) > 0:
+            note_correction(m, w, first, size, count)
+    return decision if status == ON_MAP else decision | RELEASED
+
+
+@njit(cache=True)
+def _predict(m: Memory, w: Work, kind: int, k: int) -> int:
+    """Write residual and Jacobian of the measurement in w.measured; return how many columns H has."""
+    R_m, t_m, offset = w.measured[0:9], w.measured[9:12], w.offset[0]
+    return residual_and_jacobian(kind, k, R_m, t_m, m.x, w.rate, offset, m.layout, w.residual, w.H, m.columns, w.step)
+
+
+@njit(cache=True)
+def adapt_scale(m: Memory, k: int, nis: float) -> None:
+    """Follow how large an object's innovations are against their stated size, gross errors capped."""
+    ratio = min(nis / 6.0, 4.0)
+    scale = m.scales[k] * math.exp(m.limits[ADAPTATION] * (ratio - 1.0))
+    m.scales[k] = min(max(scale, 1.0), m.limits[MAX_SCALE])
+
+
+@njit(cache=True)
+def put_object(m: Memory, w: Work, log: Columns, j: int) -> None:
+    """Put an object whose pose in the world is unknown where detection j sees it, symmetric or not."""
+    k = log.objects[j]
+    at = OBJECTS + OBJECT_SIZE * k
+    read(m, w, log, j)
+    seconds = m.x[TIME_OFFSET] - w.offset[0]
+    object_in_world(m.x, seconds, w.rate, w.measured[0:9], w.measured[9:12], m.x[at : at + OBJECT_SIZE], w.step)
+    forget_biases(m, k, False)
+    count = _predict(m, w, OBJECT_POSE, k)
+    adopt_object(m, w, k, count)
+    m.known[k] = 1.0
+    if len(m.tape) > 0:
+        note_meeting(m, w, k, count)
+
+
+@njit(cache=True)
+def follow_jumps(m: Memory, log: Columns, j: int) -> None:
+    """Networks err in runs: an object refused often in a row has another bias now, so its old one is forgotten."""
+    kind, k = log.kinds[j], log.objects[j]
+    if kind != OBJECT_POSE or m.counters[MODE] != TRACKING or m.layout[N_BIAS_KINDS] == 0:
+        return
+    for part in range(status_of(m, kind, k), 2):  # what is released cannot jump
+        used = log.decisions[j] & (POSITION_ONLY if part == 1 else ROTATION_ONLY)
+        m.refused[k, part] = 0.0 if used else m.refused[k, part] + 1.0
+        if m.refused[k, part] >= m.limits[JUMP_AFTER]:
+            _forget(m, k, 0, 3 * part, True)
+            m.refused[k, part] = 0.0
+
+
+@njit(cache=True)
+def forget_biases(m: Memory, k: int, jumped: bool) -> None:
+    """Forget every bias of an object that is put elsewhere; where its detections jumped, the varying one has too."""
+    for kind in range(m.layout[N_BIAS_KINDS]):
+        for first in (0, 3):
+            _forget(m, k, kind, first, jumped and kind == 0)
+    m.refused[k, 0] = m.refused[k, 1] = 0.0
+
+
+@njit(cache=True)
+def _forget(m: Memory, k: int, kind: int, first: int, jumped: bool) -> None:
+    forget_bias(m, k, kind, first, jumped)
+    if len(m.tape) > 0:
+        note_forgetting(m, k + kind * m.layout[N_OBJECTS], first)

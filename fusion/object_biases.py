@@ -1,0 +1,84 @@
+"""The biases of objects' detections: they relax, are forgotten where they jump, and gross errors do neither."""
+
+from __future__ import annotations
+
+import math
+
+from fusion.compiled import njit
+from fusion.memory import BIAS_TIME, NOW, Memory
+from fusion.nav_state import AT_BIASES, BIASES, N_BIAS_KINDS, N_ERROR, N_OBJECTS, Array
+
+# Places in the bias model, per kind: sigma of rotation (rad), across and along the ray (share of distance), time (s).
+BIAS_ROTATION, BIAS_ACROSS, BIAS_ALONG, BIAS_TAU, BIAS_JUMP, BIAS_JUMP_AT, BIAS_MODEL_SIZE = range(7)
+
+
+@njit(cache=True)
+def decay_biases(m: Memory) -> None:
+    """Let the object biases relax since they last did: first-order Gauss-Markov, exact for any step.
+
+    b <- phi b, P_b <- phi^2 P_b + (1 - phi^2) sigma^2 with phi = exp(-seconds / tau); an infinite tau stays put. A bias
+    far outside its sigma is a gross error in a run: it does not fade, and it wanders as far as it jumps.
+    Cross terms commute with the IMU's propagation, so this is done once per update and not once per sample.
+    """
+    seconds = (m.counters[NOW] - m.counters[BIAS_TIME]) * 1e-9
+    m.counters[BIAS_TIME] = m.counters[NOW]
+    for kind in range(m.layout[N_BIAS_KINDS]):
+        phi = math.exp(-seconds / m.bias_model[kind * BIAS_MODEL_SIZE + BIAS_TAU])
+        if phi == 1.0:
+            continue
+        for k in range(m.layout[N_OBJECTS]):
+            for first in (0, 3):
+                _decay(m, k, kind, first, phi)
+
+
+@njit(cache=True)
+def _decay(m: Memory, k: int, kind: int, first: int, phi: float) -> None:
+    x, P, n, shift = m.x, m.P, m.layout[N_ERROR], 6 * (k + kind * m.layout[N_OBJECTS])
+    b, at = m.layout[BIASES] + shift, m.layout[AT_BIASES] + shift
+    fading = fades(x, b, first, kind, m.bias_model)
+    for i in range(first, first + 3):
+        sigma = bias_sigma(m.bias_model, kind, i)
+        if fading:
+            x[b + i] *= phi
+            for j in range(n):
+                P[at + i, j] *= phi
+            for j in range(n):
+                P[j, at + i] *= phi
+        else:
+            sigma *= m.bias_model[kind * BIAS_MODEL_SIZE + BIAS_JUMP]
+        P[at + i, at + i] += (1.0 - phi * phi) * sigma * sigma
+
+
+@njit(cache=True)
+def fades(x: Array, b: int, first: int, kind: int, bias_model: Array) -> bool:
+    """Tell whether half of the bias at x[b:] is no gross error, so that it relaxes."""
+    furthest = 0.0
+    for i in range(first, first + 3):
+        furthest = max(furthest, abs(x[b + i]) / bias_sigma(bias_model, kind, i))
+    return furthest <= bias_model[kind * BIAS_MODEL_SIZE + BIAS_JUMP_AT]
+
+
+@njit(cache=True)
+def forget_bias(m: Memory, k: int, kind: int, first: int, jumped: bool) -> None:
+    """Forget an object's bias of rotation (first 0) or translation (3).
+
+    Its mean becomes zero again and its sigma, if it jumped, a multiple of the stationary one; what it knew of other
+    states is dropped.
+    """
+    shift = 6 * (k + kind * m.layout[N_OBJECTS])
+    at, b = m.layout[AT_BIASES] + shift, m.layout[BIASES] + shift
+    for i in range(first, first + 3):
+        m.x[b + i] = 0.0
+        for j in range(m.layout[N_ERROR]):
+            m.P[at + i, j] = m.P[j, at + i] = 0.0
+        scale = m.bias_model[BIAS_JUMP] if jumped else 1.0
+        m.P[at + i, at + i] = (scale * bias_sigma(m.bias_model, kind, i)) ** 2
+
+
+@njit(cache=True)
+def bias_sigma(bias_model: Array, kind: int, component: int) -> float:
+    """Return the stationary 1-sigma of one bias component: rotation (rad) 0-2, across x, across y, along 3-5."""
+    model = kind * BIAS_MODEL_SIZE
+    if component < 3:
+        return bias_model[model + BIAS_ROTATION]
+    return bias_model[model + (BIAS_ALONG if component == 5 else BIAS_ACROSS)]

@@ -1,0 +1,87 @@
+"""The options of the simulated world: the one home of their defaults."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Literal
+
+from fusion.detection_errors import NetworkErrors, WhiteErrors
+from poet_loc.core.records import ImuNoise
+
+
+@dataclass(frozen=True)
+class Displacement:
+    """One object that is moved while the log runs; the written map does not know."""
+
+    object: int = -1
+    """Which of the objects, counted from 0; -1: none."""
+    after_s: float = 30.0
+    """When, s from the log's start."""
+    until_s: float = float("inf")
+    """When it is put back, s from the log's start."""
+    distance: float = 0.2
+    """How far over the table, in a random direction, m."""
+    turn_deg: float = 0.0
+    """How far it is turned about the vertical, deg."""
+
+
+@dataclass(frozen=True)
+class SimulationOptions:
+    """The world, its sensors and their errors."""
+
+    duration_s: float = 60.0
+    """Length of the log, s."""
+    rest_s: float = 1.0
+    """Time at rest before the flight begins, s."""
+    imu_rate_hz: float = 200.0
+    """Rate of the IMU, Hz."""
+    camera_rate_hz: float = 30.0
+    """Rate of the camera and thus of the object poses, Hz."""
+    objects: int = 8
+    """Objects on the table."""
+    symmetric_objects: int = 2
+    """How many of them are symmetric: alternately a can (every turn about z) and a box (half turns about z)."""
+    seed: int = 0
+    """Everything random comes from it."""
+    noise: Literal["none", "white", "network"] = "network"
+    """Errors of the object poses: none, white with the covariance written, or like a real network's."""
+    covariances: bool | None = None
+    """Write the object poses' covariances (of the inlier error); None: with white noise only."""
+    white: WhiteErrors = field(default_factory=WhiteErrors)
+    """Errors of `noise` white."""
+    network: NetworkErrors = field(default_factory=NetworkErrors)
+    """Errors of `noise` network."""
+    imu_errors: bool = True
+    """Give the IMU white noise and wandering biases; False: exact samples."""
+    imu_noise: ImuNoise = field(default_factory=lambda: ImuNoise(1.7e-4, 2.0e-3, 2.0e-5, 3.0e-3, 200.0))
+    """Noise densities of the IMU as written to the calibration (its update rate becomes imu_rate_hz)."""
+    gyroscope_bias_sigma: float = 0.01
+    """1-sigma of the gyroscope's first bias, rad/s."""
+    accelerometer_bias_sigma: float = 0.1
+    """1-sigma of the accelerometer's first bias, m/s^2."""
+    imu_position_in_cam: tuple[float, float, float] = (0.05, -0.02, -0.03)
+    """Where the IMU sits in camera axes, m."""
+    imu_rotation_in_cam_deg: tuple[float, float, float] = (-85.0, 5.0, 3.0)
+    """Rotation vector of T_cam_imu, deg."""
+    timeshift_cam_imu_s: float = 0.0
+    """t_imu = t_cam + timeshift, written to the calibration, s."""
+    stamp_delay_s: float = 0.0
+    """Camera stamps are this much later than the exposure and the calibration does not know, s."""
+    map_position_sigma_m: float = 0.0
+    """1-sigma of the written map's position errors per axis, m; the map then carries its covariance."""
+    map_rotation_sigma_deg: float = 0.0
+    """1-sigma of the written map's rotation errors per axis, deg."""
+    moved: Displacement = field(default_factory=Displacement)
+    """An object that is moved on the way."""
+    camera_poses: bool = False
+    """Also make camera poses at the camera's rate, with white noise and its covariance."""
+    camera_pose_position_sigma_m: float = 0.02
+    """1-sigma of those camera poses' position per axis, m."""
+    camera_pose_rotation_sigma_deg: float = 1.0
+    """1-sigma of those camera poses' rotation per axis, deg."""
+    odometry: bool = False
+    """Also make T_odom_cam, which drifts."""
+    odometry_position_drift: float = 0.004
+    """Random walk of the odometry's position, m/sqrt(s)."""
+    odometry_rotation_drift_deg: float = 0.12
+    """Random walk of the odometry's rotation, deg/sqrt(s)."""
