@@ -51,11 +51,11 @@ class FixedPoint(reference_filter.ReferenceFilter):
             self.C = self.C - gain @ H @ self.m.P
         return super().condition(residual, H, R)
 
-    def _put_object(self, k, *arguments):
+    def _put_object(self, log, j):
         if hasattr(self, "C"):  # its biases are started anew on the way
             for kind in range(self.layout.bias_kinds):
-                self.C[:, self.layout.error_slice("biases", k, kind)] = 0.0
-        super()._put_object(k, *arguments)
+                self.C[:, self.layout.error_slice("biases", log.objects[j], kind)] = 0.0
+        super()._put_object(log, j)
 
     def measure(self, *arguments):
         super().measure(*arguments)
