@@ -5,6 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Literal
 
+from fusion.option_ranges import refuse_impossible
+
 
 @dataclass(frozen=True)
 class DetectionNoise:
@@ -345,3 +347,6 @@ class FuseOptions:
     odometry: Odometry = field(default_factory=Odometry)
     constant_velocity: ConstantVelocity = field(default_factory=ConstantVelocity)
     graph: Graph = field(default_factory=Graph)
+
+    def __post_init__(self) -> None:
+        refuse_impossible(self)

@@ -24,6 +24,8 @@ Array = NDArray[np.float64]
 
 WITH_IMU: tuple[Kind, ...] = ("imu", "imu+odometry")
 NEAREST_OBJECT = 1e-3  # m
+LEAST_BIAS = 1e-6
+"""1-sigma of a bias that is said to be none, rad or share of the distance: errors are measured in it."""
 STANDARD_GRAVITY = 9.81  # m/s^2
 VELOCITY_OF_ODOMETRY = 0.05  # m/s, reported beside the velocity that odometry gives
 
@@ -268,17 +270,17 @@ def _limits(options: FuseOptions) -> list[float]:
 
 def _bias_model(bias: DetectionBias) -> list[float]:
     varying = {
-        object_biases.BIAS_ROTATION: math.radians(bias.rotation_deg),
-        object_biases.BIAS_ACROSS: bias.across,
-        object_biases.BIAS_ALONG: bias.along,
+        object_biases.BIAS_ROTATION: max(math.radians(bias.rotation_deg), LEAST_BIAS),
+        object_biases.BIAS_ACROSS: max(bias.across, LEAST_BIAS),
+        object_biases.BIAS_ALONG: max(bias.along, LEAST_BIAS),
         object_biases.BIAS_TAU: bias.correlation_s,
         object_biases.BIAS_JUMP: bias.jump,
         object_biases.BIAS_JUMP_AT: bias.gross,
     }
     steady = {
-        object_biases.BIAS_ROTATION: math.radians(bias.steady_rotation_deg),
-        object_biases.BIAS_ACROSS: bias.steady_across,
-        object_biases.BIAS_ALONG: bias.steady_along,
+        object_biases.BIAS_ROTATION: max(math.radians(bias.steady_rotation_deg), LEAST_BIAS),
+        object_biases.BIAS_ACROSS: max(bias.steady_across, LEAST_BIAS),
+        object_biases.BIAS_ALONG: max(bias.steady_along, LEAST_BIAS),
         object_biases.BIAS_TAU: math.inf,
     }
     return [model.get(i, 0.0) for model in (varying, steady) for i in range(object_biases.BIAS_MODEL_SIZE)]

@@ -13,7 +13,7 @@ from fusion.fit_noise import FitNoiseOptions, FittedNoise, fit_noise
 from poet_loc.cli.arguments import Flat
 from poet_loc.cli.noise_file import noise_text
 from poet_loc.io.log_folder import read_log
-from poet_loc.io.whole_folder import write_whole_file
+from poet_loc.io.whole_folder import not_there, write_whole_file
 
 
 @dataclass(frozen=True)
@@ -26,11 +26,15 @@ class Arguments:
     """NAME of object_poses_NAME.csv; without it object_poses.csv, or the only one there is."""
     out: Path | None = None
     """Write the options here, for --noise-from of fuse and run."""
+    overwrite: bool = False
+    """Replace that file if it is there."""
     options: Flat[FitNoiseOptions] = field(default_factory=FitNoiseOptions)
 
 
 def execute(arguments: Arguments) -> None:
     """Fit, print the parts, and write the file that was asked for."""
+    if arguments.out is not None:
+        not_there(arguments.out, arguments.overwrite)
     logs = (read_log(path, arguments.detections) for path in arguments.logs)
     fitted = fit_noise(logs, arguments.detections, arguments.options)
     print("\n".join(_lines(fitted)))

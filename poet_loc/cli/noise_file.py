@@ -35,7 +35,11 @@ def with_noise_from(path: Path | None, options: FuseOptions) -> FuseOptions:
     if not isinstance(document, Mapping) or not set(document) <= {"noise", "bias"}:
         raise InputError("has more or less than noise and bias", path=path, fix=_FIX)
     noise = _changed(options.noise, document.get("noise", {}), path)
-    return replace(options, noise=noise, bias=_changed(options.bias, document.get("bias", {}), path))
+    bias = _changed(options.bias, document.get("bias", {}), path)
+    try:
+        return replace(options, noise=noise, bias=bias)
+    except InputError as error:
+        raise InputError(error.what, path=path, fix=error.fix) from None
 
 
 _FIX = "write it with poet-loc fit-noise"

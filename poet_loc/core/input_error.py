@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+from operator import attrgetter
 from pathlib import Path
 
 
@@ -31,3 +33,20 @@ def at_least(least: float, options: object, *names: str) -> None:
         value = getattr(options, name)
         if not isinstance(value, int | float) or not value >= least:
             raise InputError(f"{name.replace('_', '-')} is {value!r}", fix=f"give at least {least:g}")
+
+
+def within(interval: str, options: object, *names: str) -> None:
+    """Raise InputError for a field of an options record outside an interval such as "(0, 1]" or "[0, inf)".
+
+    A field of a record in the record is named with a dot: bias.correlation_s.
+    """
+    low, high = (float(end) for end in interval[1:-1].split(","))
+    open_low, open_high = interval[0] == "(", interval[-1] == ")"
+    least = f"more than {low:g}" if open_low else f"at least {low:g}"
+    most = f"less than {high:g}" if open_high else f"at most {high:g}"
+    for name in names:
+        value = attrgetter(name)(options)
+        inside = isinstance(value, int | float) and low <= value <= high
+        if not inside or (open_low and value == low) or (open_high and value == high):
+            fix = f"give {least}" if math.isinf(high) and value != high else f"give {least} and {most}"
+            raise InputError(f"{name.replace('_', '-')} is {value!r}", fix=fix)
