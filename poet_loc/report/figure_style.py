@@ -11,8 +11,10 @@ from typing import Any, ParamSpec, TypeVar
 import matplotlib as mpl
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.axis import Axis
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
+from matplotlib.ticker import LogLocator, NullFormatter, StrMethodFormatter
 from numpy.typing import NDArray
 
 from poet_loc.core.input_error import InputError
@@ -103,6 +105,18 @@ def broken(seconds: NDArray[Any], *columns: NDArray[Any]) -> list[NDArray[np.flo
     steps = np.diff(seconds)
     gaps = np.flatnonzero(steps > 3.0 * np.median(steps)) + 1
     return [np.insert(seconds, gaps, np.nan), *[np.insert(column, gaps, np.nan, axis=0) for column in columns]]
+
+
+def logarithmic(axis: Axis) -> None:
+    """Make an axis logarithmic, with as many plain numbers beside it as have room."""
+    axis.axes.set(**{f"{axis.axis_name}scale": "log"})  # type: ignore[attr-defined]
+    low, high = axis.get_view_interval()
+    decades = np.log10(high / low)
+    room = 5 if axis.axis_name == "y" else 8  # type: ignore[attr-defined]
+    subs = next((each for each in ((1, 2, 3, 5, 7), (1, 2, 5), (1, 3)) if len(each) * decades < room), (1,))
+    axis.set_major_locator(LogLocator(subs=subs, numticks=room))
+    axis.set_major_formatter(StrMethodFormatter("{x:g}"))
+    axis.set_minor_formatter(NullFormatter())
 
 
 def legend_below(figure: Figure, axes: Axes, columns: int = 4) -> None:

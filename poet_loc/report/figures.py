@@ -27,6 +27,7 @@ from poet_loc.report.figure_style import (
     label,
     legend_below,
     line_styles,
+    logarithmic,
     new_figure,
     save_figures,
     styled,
@@ -116,10 +117,10 @@ def distribution_figure(evaluation: Evaluation) -> Figure:
                 share = np.arange(1, len(values) + 1) / len(values)
                 panel.plot(np.sort(values), share, label=label(row), **styles[row.name])
     for k, (panel, text) in enumerate(zip(axes[0], ("position error [mm]", "attitude error [deg]"), strict=True)):
-        panel.set_xscale("log")
         values = np.concatenate([_totals(row.common())[k] for row in evaluation.rows])
         if np.any(values > 0):
             panel.set_xlim(np.percentile(values[values > 0], 0.5) / 1.2, values.max() * 1.2)
+        logarithmic(panel.xaxis)
         panel.set_xlabel(text)
         panel.set_ylim(0.0, 1.005)
     axes[0, 0].set_ylabel("share of the common frames")
@@ -143,7 +144,7 @@ def trajectory_figure(record: RunRecord, body: Body) -> Figure:
     for i, j, axis in _PANELS:
         axes[i, j].set_ylabel(f"{axis} [{'deg' if j else 'm'}]")
         if truth is not None:
-            axes[i, j].set_ylim(*_range(axes[i, j].lines[0].get_ydata()))
+            axes[i, j].set_ylim(*_range(*(line.get_ydata() for line in axes[i, j].lines)))
     for panel in axes[-1]:
         panel.set_xlabel(_TIME)
     figure.suptitle(f"Pose of the {_BODY_NAMES[body]} in the world", fontsize=9)
@@ -208,6 +209,7 @@ def consistency_figure(row: Row, gate: Gates | None = None, start_ns: int = 0) -
         panel.set_ylabel("NEES / dof [-]" if panel is axes[0, 0] else "NIS / dof [-]")
         low, high = panel.get_ylim()
         panel.set_ylim(max(low, 1e-3), high)
+        logarithmic(panel.yaxis)
     axes[-1, 0].set_xlabel(_TIME)
     figure.suptitle(f"{label(row)}: consistency, with the 95 % bounds of a single stamp", fontsize=9)
     legend_below(figure, axes[-1, 0])
@@ -299,10 +301,17 @@ def _marks(estimate: Estimate) -> dict[str, Any]:
     )
 
 
-def _range(values: Any) -> tuple[float, float]:
-    """The range of the truth and a quarter more, so that an estimate's gross errors do not shrink everything else."""
-    low, high = np.nanmin(values), np.nanmax(values)
-    margin = 0.25 * (high - low) + 1e-3
+def _range(truth: Any, *estimates: Any) -> tuple[float, float]:
+    """Return the range of the truth and most of each estimate, at most thrice the truth's, and a quarter more.
+
+    So an estimate's gross errors do not shrink everything else.
+    """
+    least, most = np.nanmin(truth), np.nanmax(truth)
+    span = most - least
+    ends = np.array([np.nanpercentile(each, [1.0, 99.0]) for each in estimates if np.isfinite(each).any()])
+    low, high = (min(least, *ends[:, 0]), max(most, *ends[:, 1])) if len(ends) else (least, most)
+    low, high = max(low, least - span), min(high, most + span)
+    margin = 0.25 * span + 1e-3
     return float(low - margin), float(high + margin)
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from dataclasses import replace
+from itertools import pairwise
 from pathlib import Path
 
 import matplotlib as mpl
@@ -12,12 +13,13 @@ import pytest
 from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
 from PIL import Image
+from scipy.spatial.transform import RigidTransform
 
 from poet_loc.core.input_error import InputError
 from poet_loc.report import figure_style
 from poet_loc.report import figures as figures_module
 from poet_loc.report.evaluate import ERROR_AXES
-from poet_loc.report.figures import draw_run, error_figure, write_figures
+from poet_loc.report.figures import draw_run, error_figure, trajectory_figure, write_figures
 from poet_loc.report.run_record import ACCEPTED, POSITION_ONLY, REFUSED, ROTATION_ONLY, RunRecord
 
 EXPECTED = {
@@ -77,6 +79,36 @@ def test_gross_errors_do_not_shrink_the_rest(run_record: RunRecord) -> None:
     axes = error_figure(replace(row, errors=errors)).axes[0]
     assert axes.get_ylim()[1] < 200.0
     assert "1 of 102 beyond, up to 50000 mm" in axes.get_title("right")
+
+
+@pytest.mark.parametrize("span", [(0.15, 6.0), (11.0, 80.0), (0.3, 0.9), (1e-3, 1e3), (1e-6, 1e5)])
+def test_numbers_at_logarithmic_axes_are_plain_and_apart(span: tuple[float, float]) -> None:
+    figure, axes = figure_style.new_figure(1, 2, 2.8, sharex=False)
+    axes[0, 0].set(xlim=span)
+    axes[0, 1].set(ylim=span)
+    figure_style.logarithmic(axes[0, 0].xaxis)
+    figure_style.logarithmic(axes[0, 1].yaxis)
+    figure.draw_without_rendering()
+    for axis, side in ((axes[0, 0].xaxis, 0), (axes[0, 1].yaxis, 1)):
+        ticks = [*axis.get_major_ticks(), *axis.get_minor_ticks()]
+        shown = [tick.label1 for tick in ticks if tick.label1.get_text() and span[0] <= tick.get_loc() <= span[1]]
+        boxes = sorted(label.get_window_extent().get_points()[:, side].tolist() for label in shown)
+        assert len(shown) >= 2
+        assert all(float(label.get_text().replace("\N{MINUS SIGN}", "-")) > 0 for label in shown)
+        assert all(one[1] < other[0] for one, other in pairwise(boxes))
+
+
+def test_an_estimate_beside_the_truth_stays_in_the_picture(run_record: RunRecord) -> None:
+    truth = run_record.references["imu"]
+    height = truth.T_world_body.translation[:, 2]
+    for metres, whole in ((0.8 * np.ptp(height), True), (50.0 * np.ptp(height), False)):
+        moved = RigidTransform.from_translation([0.0, 0.0, metres]) * truth.T_world_body
+        estimate = replace(run_record.estimates[-1], trajectory=replace(truth, T_world_body=moved))
+        figure = trajectory_figure(replace(run_record, estimates=(estimate,)), "imu")
+        low, high = next(axes for axes in figure.axes if axes.get_ylabel() == "z [m]").get_ylim()
+        assert low < height.min()
+        assert (high > height.max() + metres) == whole
+        assert high - low < 4.0 * np.ptp(height) + 0.1
 
 
 def test_lines_do_not_bridge_gaps() -> None:
