@@ -17,7 +17,7 @@ from scipy.optimize import least_squares
 
 from fusion.options import DetectionBias, DetectionNoise
 from fusion.prepare import NEAREST_OBJECT, landmark_of_detection
-from poet_loc.core.input_error import InputError
+from poet_loc.core.input_error import InputError, within
 from poet_loc.core.records import ObjectPoses
 from poet_loc.io.log_folder import Log
 
@@ -39,6 +39,10 @@ class FitNoiseOptions:
     """Autocovariances are fitted up to this lag, s."""
     min_detections: int = 100
     """An object with fewer good detections in a log is left out."""
+
+    def __post_init__(self) -> None:
+        within("(0, inf]", self, "gross_distance", "gross_angle_deg", "longest_lag_s")
+        within("[2, inf]", self, "min_detections")
 
 
 @dataclass(frozen=True)

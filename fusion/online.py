@@ -48,7 +48,7 @@ from fusion.place_watch import (
 )
 from fusion.prepare import NEAREST_OBJECT, Problem, fill_memory, layout_for, time_shift_ns
 from poet_loc.core.geometry import make_pose
-from poet_loc.core.input_error import InputError
+from poet_loc.core.input_error import InputError, within
 from poet_loc.core.records import Calibration, ImuSamples, LandmarkMap
 
 Array = NDArray[np.float64]
@@ -69,6 +69,10 @@ class OnlineOptions:
     """The buffers hold the horizon at this rate of the IMU, Hz; above it the horizon shrinks."""
     max_pose_rate_hz: float = 1000.0
     """The buffers hold so many poses per second, over all objects, Hz; what does not fit is refused and counted."""
+
+    def __post_init__(self) -> None:
+        within("(0, inf)", self, "snapshot_s", "max_imu_rate_hz", "max_pose_rate_hz")
+        within("[0, inf)", self, "horizon_s", "ahead_s")
 
 
 @dataclass(frozen=True)

@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 from typing import Literal
 
 from fusion.detection_errors import NetworkErrors, WhiteErrors
+from poet_loc.core.input_error import InputError, within
 from poet_loc.core.records import ImuNoise
 
 
@@ -85,3 +86,46 @@ class SimulationOptions:
     """Random walk of the odometry's position, m/sqrt(s)."""
     odometry_rotation_drift_deg: float = 0.12
     """Random walk of the odometry's rotation, deg/sqrt(s)."""
+
+    def __post_init__(self) -> None:
+        within("[0.5, inf)", self, "duration_s")
+        within("(0, inf)", self, "imu_rate_hz", "camera_rate_hz")
+        within("[1, inf)", self, "objects")
+        within("[-1, inf)", self, "moved.object")
+        within("(-inf, inf)", self, "timeshift_cam_imu_s", "stamp_delay_s", "moved.distance", "moved.turn_deg")
+        within("(-inf, inf]", self, "moved.after_s", "moved.until_s")
+        within("[0, inf)", self, "seed", "symmetric_objects", *_SIZES)
+        within("[0, 1]", self, "network.bias_share", "network.correlated_share")
+        within("[0, 1)", self, "network.gross_share", "network.flip_share", "network.dropout_share")
+        within("(0, inf]", self, "network.correlation_time_s")
+        if self.network.bias_share + self.network.correlated_share > 1.0:
+            raise InputError("network.bias-share and network.correlated-share add up to more than 1", fix="lower one")
+        if self.moved.object >= self.objects:
+            what = f"moved.object is {self.moved.object}, and there are {self.objects} objects"
+            raise InputError(what, fix="count them from 0")
+
+
+_SIZES = (
+    "rest_s",
+    "gyroscope_bias_sigma",
+    "accelerometer_bias_sigma",
+    "map_position_sigma_m",
+    "map_rotation_sigma_deg",
+    "camera_pose_position_sigma_m",
+    "camera_pose_rotation_sigma_deg",
+    "odometry_position_drift",
+    "odometry_rotation_drift_deg",
+    "white.across_m",
+    "white.along_of_depth",
+    "white.rotation_deg",
+    "network.across_m",
+    "network.along_of_depth",
+    "network.rotation_deg",
+    "network.gross_run_s",
+    "network.flip_run_s",
+    "network.dropout_run_s",
+    "imu_noise.gyroscope_noise_density",
+    "imu_noise.accelerometer_noise_density",
+    "imu_noise.gyroscope_random_walk",
+    "imu_noise.accelerometer_random_walk",
+)

@@ -5,6 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Literal
 
+from poet_loc.core.input_error import InputError, within
+
 Mode = Literal["all", "out", "prev", "best", "robust"]
 """all: every vote is averaged; out: the largest set of votes that agree; prev: the same, ties by the previous frame;
 best: the single vote nearest the ground truth, an oracle; robust: weighted consensus with covariances and memory."""
@@ -79,3 +81,13 @@ class SolverOptions:
     """robust: share of good detections within the gate; beyond it a detection counts as refused."""
     memory: Memory = field(default_factory=Memory)
     """robust: what is kept of the past."""
+
+    def __post_init__(self) -> None:
+        within("(0, 1)", self, "gate_probability")
+        within("[0, 1]", self, "memory.white_share")
+        within("(0, inf)", self, "noise.rotation_deg")
+        within("[0, inf)", self, "noise.across", "noise.along", "noise.least")
+        within("[0, inf]", self, "distance", "angle_deg", "memory.evidence_s", "memory.hold_s")
+        within("[0, inf)", self, "memory.speed", "memory.turn_rate_deg")
+        if self.noise.least + min(self.noise.across, self.noise.along) == 0.0:
+            raise InputError("noise.least is 0 and so is another part of the noise", fix="give one of them more than 0")

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from poet_loc.core.input_error import InputError
+from poet_loc.core.input_error import InputError, processes, within
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -57,6 +57,11 @@ class VideoOptions:
     progress: bool = True
     """Show a progress bar."""
 
+    def __post_init__(self) -> None:
+        within("(0, inf)", self, "frame_rate_hz", "focal_px")
+        within("[0, inf)", self, "first", "seed", "world_seed", "exposure_s")
+        processes("jobs", self.jobs)
+
 
 def render_videos(options: VideoOptions) -> list[Path]:
     """Render the videos that are not there yet and return the log folders.  Raises InputError for senseless options."""
@@ -68,6 +73,8 @@ def render_videos(options: VideoOptions) -> list[Path]:
 
     if options.videos < 1 or not 2.0 <= options.duration_s[0] <= options.duration_s[1]:
         raise InputError(f"cannot render {options.videos} videos of {options.duration_s} s", fix="at least one of 2 s")
+    if min(options.size) < 16:
+        raise InputError(f"cannot render images of size {options.size}", fix="at least 16 pixels each way")
     if not 1 <= options.objects[0] <= options.objects[1] <= 10:
         raise InputError(f"cannot put {options.objects} of ten objects on the table", fix="1 to 10")
     write_models(options.out / "models", load_assets(options.world_seed).objects)

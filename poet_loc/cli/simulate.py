@@ -15,7 +15,7 @@ from landmarks.options import Mode
 from poet_loc.cli.arguments import Flat
 from poet_loc.cli.estimates import FUSIONS, Fusion, StageOptions, estimate_log, refuse_one_estimator
 from poet_loc.cli.terminal import Silent, print_tables
-from poet_loc.core.input_error import InputError
+from poet_loc.core.input_error import InputError, processes
 from poet_loc.io.log_folder import write_log
 from poet_loc.io.whole_folder import whole_folder
 from poet_loc.report.summary import RowSummary, Summary, to_summary
@@ -49,6 +49,7 @@ class Arguments:
 def execute(arguments: Arguments) -> None:
     """Write the log, print the table of the runs, or both."""
     refuse_one_estimator(arguments.options.fusion)
+    processes("workers", arguments.workers)
     if arguments.out is None and arguments.runs < 1:
         raise InputError("nothing to do", fix="give --out LOG, --runs N, or both")
     if arguments.out is not None:
@@ -105,5 +106,10 @@ def _summaries(arguments: Arguments) -> list[Summary]:
         from distributed import Client
     except ImportError:
         raise InputError("a cluster needs dask.distributed", fix="pip install 'poet-loc[cluster]'") from None
-    with Client(arguments.cluster) as client:  # type: ignore[no-untyped-call]
+    try:
+        client = Client(arguments.cluster)  # type: ignore[no-untyped-call]
+    except (OSError, ValueError) as error:
+        what = f"no dask scheduler answers at {arguments.cluster}: {error}"
+        raise InputError(what, fix="start one with dask scheduler, and give its tcp://HOST:PORT") from None
+    with client:
         return simulate_runs(function, seeds, client=client)

@@ -35,6 +35,12 @@ def at_least(least: float, options: object, *names: str) -> None:
             raise InputError(f"{name.replace('_', '-')} is {value!r}", fix=f"give at least {least:g}")
 
 
+def processes(name: str, count: int) -> None:
+    """Raise InputError for a number of processes that is 0: joblib counts up from 1, or down from -1, all cores."""
+    if count == 0:
+        raise InputError(f"{name} is 0", fix="give the number of processes, or -1 for one per core")
+
+
 def within(interval: str, options: object, *names: str) -> None:
     """Raise InputError for a field of an options record outside an interval such as "(0, 1]" or "[0, inf)".
 

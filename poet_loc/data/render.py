@@ -15,7 +15,7 @@ from pathlib import Path
 
 import numpy as np
 
-from poet_loc.core.input_error import InputError
+from poet_loc.core.input_error import InputError, at_least, processes
 
 
 @dataclass(frozen=True)
@@ -46,6 +46,10 @@ class RenderOptions:
     """Processes; -1: one per core."""
     progress: bool = True
     """Show a progress bar."""
+
+    def __post_init__(self) -> None:
+        at_least(0, self, "first_scene", "seed", "world_seed")
+        processes("jobs", self.jobs)
 
 
 def render(options: RenderOptions) -> Path:

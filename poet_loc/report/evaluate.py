@@ -12,7 +12,7 @@ from scipy.spatial.transform import RigidTransform
 
 from poet_loc.core.consistency import pose_nees
 from poet_loc.core.errors import attitude_error, position_error, rotation_angle
-from poet_loc.core.input_error import InputError
+from poet_loc.core.input_error import InputError, within
 from poet_loc.core.records import CameraPoses
 from poet_loc.core.trajectory import Trajectory, nearest_stamps
 from poet_loc.report.fused import Fused
@@ -67,6 +67,10 @@ class EvaluateOptions:
     trajectory at the IMU's rate has a pose at every frame, and poses at frames never speak for a frame they missed."""
     confidence: float = 0.95
     """Probability that a consistent estimate's NEES lies within its bounds."""
+
+    def __post_init__(self) -> None:
+        within("[0, inf]", self, "max_offset_s", "max_gap_s")
+        within("(0, 1)", self, "confidence")
 
 
 @dataclass(frozen=True)
