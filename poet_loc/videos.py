@@ -63,11 +63,17 @@ class VideoOptions:
         processes("jobs", self.jobs)
 
 
+_OF_THE_IMAGES = (
+    "duration_s", "frame_rate_hz", "size", "focal_px", "objects", "exposure_s", "seed", "world_seed"
+)  # fmt: skip
+
+
 def render_videos(options: VideoOptions) -> list[Path]:
     """Render the videos that are not there yet and return the log folders.  Raises InputError for senseless options."""
     from joblib import Parallel, delayed
 
     from poet_loc.data.render import show_progress
+    from poet_loc.data.rendered import keep_to_options
     from poet_loc.data.world.bop_writer import write_models
     from poet_loc.data.world.view import load_assets
 
@@ -77,6 +83,7 @@ def render_videos(options: VideoOptions) -> list[Path]:
         raise InputError(f"cannot render images of size {options.size}", fix="at least 16 pixels each way")
     if not 1 <= options.objects[0] <= options.objects[1] <= 10:
         raise InputError(f"cannot put {options.objects} of ten objects on the table", fix="1 to 10")
+    keep_to_options(options.out, options, *_OF_THE_IMAGES)
     write_models(options.out / "models", load_assets(options.world_seed).objects)
     numbers = range(options.first, options.first + options.videos)
     missing = [number for number in numbers if not video_folder(options, number).exists()]

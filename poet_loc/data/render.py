@@ -16,6 +16,7 @@ from pathlib import Path
 import numpy as np
 
 from poet_loc.core.input_error import InputError, at_least, processes
+from poet_loc.data.rendered import keep_to_options
 
 
 @dataclass(frozen=True)
@@ -55,7 +56,7 @@ class RenderOptions:
 def render(options: RenderOptions) -> Path:
     """Render random scenes of the world into options.out / options.split and return that folder.
 
-    Raises InputError for sizes or counts that make no sense.
+    Raises InputError for sizes or counts that make no sense, and for a folder with images of other options.
     """
     from joblib import Parallel, delayed
 
@@ -64,13 +65,17 @@ def render(options: RenderOptions) -> Path:
 
     if options.images < 1 or options.images_per_scene < 1 or min(options.size) < 16:
         raise InputError(f"cannot render {options.images} images of size {options.size}", fix="use positive numbers")
-    write_models(options.out / "models", load_assets(options.world_seed).objects)
     folder = options.out / options.split
+    keep_to_options(options.out, options, "world_seed")
+    keep_to_options(folder, options, "seed", "size", "images_per_scene", "masks", "depth")
+    write_models(options.out / "models", load_assets(options.world_seed).objects)
     counts = [options.images_per_scene] * (options.images // options.images_per_scene)
     if options.images % options.images_per_scene:
         counts.append(options.images % options.images_per_scene)
     numbers = [options.first_scene + index for index in range(len(counts))]
-    missing = [(number, count) for number, count in zip(numbers, counts) if not (folder / f"{number:06d}").exists()]
+    missing = [
+        (number, count) for number, count in zip(numbers, counts) if not _is_whole(folder / f"{number:06d}", count)
+    ]
     workers = Parallel(
         n_jobs=min(len(missing), options.jobs) if options.jobs > 0 else options.jobs, return_as="generator_unordered"
     )
@@ -78,6 +83,10 @@ def render(options: RenderOptions) -> Path:
     done = workers(tasks) if missing else ()
     show_progress(done, len(counts), len(counts) - len(missing), "scenes", options.progress)
     return folder
+
+
+def _is_whole(scene: Path, count: int) -> bool:
+    return len(list((scene / "rgb").glob("*.jpg"))) >= count
 
 
 def render_scene(options: RenderOptions, number: int, count: int) -> int:
@@ -101,6 +110,7 @@ def render_scene(options: RenderOptions, number: int, count: int) -> int:
         geometry = place(assets, scene, T_cam_world, intrinsics)
         writer.add(index, expose(light, sensor, rng), sensor.quality, scene, T_cam_world, intrinsics, geometry)
     writer.close()
+    shutil.rmtree(final, ignore_errors=True)  # one with fewer images, as an earlier run was asked for
     partial.rename(final)
     return number
 

@@ -52,6 +52,30 @@ def test_an_interrupted_run_goes_on(world, tmp_path):
     assert contents(tmp_path) == contents(world)
 
 
+def test_more_images_than_before_are_those_of_one_run(world, tmp_path):
+    render(options(tmp_path, images=2))
+    render(options(tmp_path))
+    assert contents(tmp_path) == contents(world)
+    render(options(tmp_path, images=1))
+    assert contents(tmp_path) == contents(world)
+
+
+@pytest.mark.parametrize(
+    ("change", "told"),
+    [
+        ({"seed": 1}, "--seed 0, not 1"),
+        ({"size": (96, 64)}, "--size 80 60, not 96 64"),
+        ({"masks": False}, "--masks True, not False"),
+        ({"split": "other", "world_seed": 2}, "--world-seed 0, not 2"),
+    ],
+)
+def test_images_of_other_options_are_not_mixed(world, change, told):
+    before = contents(world)
+    with pytest.raises(InputError, match=f"was rendered with {told}"):
+        render(options(world, **change))
+    assert contents(world) == before
+
+
 def test_our_own_reader_reads_it_and_things_stand_on_the_table(world):
     scene = read_bop_scene(world / "train/000000")
     assert len(scene) == 3
