@@ -6,7 +6,9 @@ module of the command that was asked for is imported.
 
 from __future__ import annotations
 
+import signal
 import sys
+import threading
 import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -41,15 +43,17 @@ COMMANDS = {
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run a command and return its exit status: 0, 1 after a user's mistake, 130 after Ctrl-C."""
+    """Run a command and return its exit status: 0, 1 after a user's mistake, 130 after Ctrl-C, 143 when terminated."""
     argv = list(sys.argv[1:] if arguments is None else arguments)
     try:
-        with _warnings_as_lines():
+        with _warnings_as_lines(), _termination_tidies_up():
             status = dispatch("poet-loc", COMMANDS, "poet_loc.cli", argv)
             sys.stdout.flush()
             return status
     except InputError as error:
         return _one_line(str(error), 1)
+    except _Terminated:
+        return _one_line("terminated", 143)
     except KeyboardInterrupt:
         return _one_line("interrupted", 130)
     except BrokenPipeError:
@@ -124,6 +128,27 @@ def _overview(program: str, commands: Mapping[str, str]) -> str:
 def _one_line(message: str, status: int) -> int:
     print(f"poet-loc: {message}", file=sys.stderr)
     return status
+
+
+class _Terminated(KeyboardInterrupt):
+    """SIGTERM came, as from kill, timeout or a cluster's queue."""
+
+
+@contextmanager
+def _termination_tidies_up() -> Iterator[None]:
+    """Let SIGTERM end the command as Ctrl-C does: what is half-written goes, and so do worker processes."""
+
+    def leave(*_: object) -> None:
+        raise _Terminated
+
+    if threading.current_thread() is not threading.main_thread():  # where signals cannot be handled
+        yield
+        return
+    before = signal.signal(signal.SIGTERM, leave)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, before)
 
 
 @contextmanager

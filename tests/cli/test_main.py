@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import signal
 import subprocess
 import sys
 from dataclasses import dataclass
@@ -12,6 +13,7 @@ import pytest
 from poet_loc.cli import main as command_line
 from poet_loc.cli.main import COMMANDS, main
 from poet_loc.core.input_error import InputError
+from poet_loc.io.whole_folder import whole_folder
 
 
 def one_line(capsys) -> str:
@@ -110,6 +112,20 @@ def test_interruption_is_one_line_and_status_130(planted, capsys):
     planted(execute)
     assert main(["plant"]) == 130
     assert one_line(capsys) == "poet-loc: interrupted\n"
+
+
+def test_termination_tidies_up_as_an_interruption_does(planted, tmp_path, capsys):
+    before = signal.getsignal(signal.SIGTERM)
+
+    def execute(arguments):
+        with whole_folder(tmp_path / "run"):
+            signal.raise_signal(signal.SIGTERM)
+
+    planted(execute)
+    assert main(["plant"]) == 143
+    assert one_line(capsys) == "poet-loc: terminated\n"
+    assert not list(tmp_path.iterdir())
+    assert signal.getsignal(signal.SIGTERM) is before
 
 
 def test_a_bug_keeps_its_traceback(planted):
