@@ -29,7 +29,7 @@ STAGES = (
     ("convert kitti and openvins", "poet_loc.io.convert_trajectory", "ConvertTrajectoryOptions"),
     ("convert super6d", "poet_loc.io.convert_super6d", "ConvertSuper6dOptions"),
     ("convert annotation", "poet_loc.io.convert_annotation", "ConvertAnnotationOptions"),
-    ("evaluate-poses", "poet_loc.report.pose_evaluation", "EvaluatePosesOptions"),
+    ("evaluate-poses", "poet_loc.report.pose_inputs", "EvaluatePosesOptions"),
     ("render images", "poet_loc.data.render", "RenderOptions"),
     ("render videos", "poet_loc.videos", "VideoOptions"),
 )

@@ -15,11 +15,17 @@ from types import FunctionType
 from typing import Any
 
 import numba
+from llvmlite import ir
 from numba.core.codegen import JITCodeLibrary
 from numba.core.compiler import Compiler
+from numba.core.datamodel.manager import DataModelManager
+from numba.core.datamodel.models import TupleModel
+from numba.core.datamodel.registry import default_manager
 from numba.core.errors import NumbaError
 
 ALLOCATES = frozenset({"zeros", "empty", "ones", "full", "array", "arange", "copy"})
+
+_ITEMS, _DATA, _SHAPE, _STRIDES = 2, 4, 5, 6  # places in numba's array
 
 _cached: list[Any] = []
 
@@ -42,6 +48,59 @@ def njit(*arguments: Any, **options: Any) -> Any:
         index._source_stamp = kernel_stamp()
         _cached.append(dispatcher)
     return dispatcher
+
+
+class _LeanTuple(TupleModel):  # type: ignore[misc]
+    """A named tuple of contiguous arrays as an argument: where each begins and its shape, from which the rest follows.
+
+    Its value is some hundred numbers, which every call between kernels would hand over.
+    """
+
+    def get_argument_type(self) -> Any:
+        return tuple(whole[_DATA : _SHAPE + 1] for whole in super().get_argument_type())
+
+    def as_argument(self, builder: Any, value: Any) -> Any:
+        def part(*place: int) -> Any:
+            return builder.extract_value(value, place)
+
+        sizes = enumerate(each.ndim for each in self._members)
+        return tuple((part(i, _DATA), tuple(part(i, _SHAPE, axis) for axis in range(n))) for i, n in sizes)
+
+    def from_argument(self, builder: Any, value: Any) -> Any:
+        """Put the arrays together; nobody counts references to them, and no object of Python's owns them."""
+        kinds = self.get_value_type().elements
+        struct = ir.Constant(self.get_value_type(), list(map(_blank, kinds, self._members)))
+        for i, (data, shape) in enumerate(value):
+            struct = builder.insert_value(struct, data, (i, _DATA))
+            items = shape[-1]
+            for axis in reversed(range(len(shape))):
+                struct = builder.insert_value(struct, shape[axis], (i, _SHAPE, axis))
+                if axis > 0:
+                    stride = builder.mul(items, items.type(self._members[i].dtype.bitwidth // 8))
+                    struct = builder.insert_value(struct, stride, (i, _STRIDES, axis - 1))
+                    items = builder.mul(items, shape[axis - 1])
+            struct = builder.insert_value(struct, items, (i, _ITEMS))
+        return struct
+
+
+def _blank(kind: Any, array: Any) -> ir.Constant:
+    """Return an array of nothing."""
+    meminfo, parent, number, _, data, shape, strides = kind.elements
+    size = number(array.dtype.bitwidth // 8)
+    parts = [meminfo(None), parent(None), number(0), size, data(None), shape(None), strides([size] * array.ndim)]
+    return ir.Constant(kind, parts)
+
+
+def _named_tuple_model(manager: DataModelManager, named_tuple: numba.types.NamedTuple) -> TupleModel:
+    own = named_tuple.instance_class.__module__.startswith("fusion.")
+    return (_LeanTuple if own and all(map(_is_contiguous, named_tuple)) else TupleModel)(manager, named_tuple)
+
+
+def _is_contiguous(member: numba.types.Type) -> bool:
+    return isinstance(member, numba.types.Array) and member.layout == "C"
+
+
+default_manager.register(numba.types.NamedTuple, _named_tuple_model)
 
 
 def kernels_from_scratch() -> int:

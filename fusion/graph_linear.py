@@ -21,6 +21,7 @@ from fusion.graph_model import (
 )
 from fusion.measurements import OBJECT_POSE
 from fusion.nav_state import ACCEL_BIAS, GYRO_BIAS, N_BIAS_KINDS, N_OBJECTS, VELOCITY, Array, Ints
+from fusion.so3_kernels import copy
 
 NO_KERNEL, HUBER, CAUCHY = range(3)
 KERNELS = {"none": NO_KERNEL, "huber": HUBER, "cauchy": CAUCHY}
@@ -66,7 +67,7 @@ def linearise(
         above, end = 0 if passed[n] & ROTATION_ONLY else 3, 6 if passed[n] & POSITION_ONLY else 3
         motion = motion_between(motion_stamps, motion_values, keyframe_ns, stamps[i], biases, odometry)
         rate = rate_at(motion_stamps, motion_values, stamps[i], biases[0:3])
-        x[:] = start
+        copy(start, x)
         if odometry:  # it knows no velocity
             x[VELOCITY : VELOCITY + 3] = 0.0
         e, J = error_and_jacobian(
@@ -129,14 +130,14 @@ def _compress(rows: Array, owners: Ints, n_objects: int, private: int) -> tuple[
         size = 0
         for r in range(len(rows)):
             if owners[r] == k:
-                block[size] = rows[r]
+                copy(rows[r], block[size])
                 size += 1
         taken = triangularise(block[:size], private) if k >= 0 else 0
         for r in range(size):
             if r < taken:
-                own[k, r] = block[r]
+                copy(block[r], own[k, r])
             else:
-                shared[left] = block[r, private:]
+                copy(block[r, private:], shared[left])
                 left += 1
         if k >= 0:
             counts[k] = taken

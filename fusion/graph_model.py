@@ -28,7 +28,7 @@ from fusion.nav_state import (
 )
 from fusion.object_biases import BIAS_JUMP, BIAS_MODEL_SIZE, BIAS_TAU, bias_sigma, fades
 from fusion.odometry import move_by_odometry
-from fusion.so3_kernels import apply, apply_transposed, multiply
+from fusion.so3_kernels import apply, apply_transposed, copy, multiply
 
 # Places in a motion between two stamps: seconds, R_first_second, displacement and velocity free of gravity.
 SECONDS, TURN, SHIFT, SPEED, MOTION_SIZE = 0, 1, 10, 13, 16
@@ -75,7 +75,7 @@ def motion_between(stamps: Ints, values: Array, start: int, end: int, biases: Ar
 
     values (N, 6): the IMU's, or odometry's twists.
     """
-    x, work, motion = np.zeros(OBJECTS), np.zeros(64), np.zeros(MOTION_SIZE)
+    x, work, motion, mean = np.zeros(OBJECTS), np.zeros(64), np.zeros(MOTION_SIZE), np.zeros(6)
     for i in range(9):
         x[i] = 1.0 if i % 4 == 0 else 0.0
     for i in range(6):
@@ -89,14 +89,15 @@ def motion_between(stamps: Ints, values: Array, start: int, end: int, biases: Ar
             move_by_odometry(x, dt, values[k, 0:3], values[k, 3:6], work)
         else:
             share = 0.5 * ((now - stamps[k]) + (stop - stamps[k])) / (stamps[k + 1] - stamps[k])
-            mean = values[k] + share * (values[k + 1] - values[k])
+            for i in range(6):
+                mean[i] = values[k, i] + share * (values[k + 1, i] - values[k, i])
             propagate_nominal(x, dt, mean[0:3], mean[3:6], work)
         now, k = stop, k + 1
     motion[SECONDS] = 0.0 if odometry else (end - start) * 1e-9
-    motion[TURN : TURN + 9] = x[0:9]
-    motion[SHIFT : SHIFT + 3] = x[POSITION : POSITION + 3]
+    copy(x, motion[TURN : TURN + 9])
+    copy(x[POSITION:], motion[SHIFT : SHIFT + 3])
     if not odometry:
-        motion[SPEED : SPEED + 3] = x[VELOCITY : VELOCITY + 3]
+        copy(x[VELOCITY:], motion[SPEED : SPEED + 3])
     return motion
 
 
@@ -119,7 +120,10 @@ def rate_at(stamps: Ints, values: Array, stamp: int, gyro_bias: Array) -> Array:
     k = int(np.searchsorted(stamps, stamp, side="right")) - 1
     k = k - 1 if k == len(stamps) - 1 else k
     share = (stamp - stamps[k]) / (stamps[k + 1] - stamps[k])
-    return values[k, 0:3] + share * (values[k + 1, 0:3] - values[k, 0:3]) - gyro_bias
+    rate = np.empty(3)
+    for i in range(3):
+        rate[i] = values[k, i] + share * (values[k + 1, i] - values[k, i]) - gyro_bias[i]
+    return rate
 
 
 @njit(cache=True)

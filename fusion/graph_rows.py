@@ -11,6 +11,7 @@ from fusion.compiled import njit
 from fusion.filter_motion import advance
 from fusion.memory import IMU_AT, MODE, NOW, TRACKING, views, work_views
 from fusion.nav_state import CORE, EXTRINSIC_ROTATION, OBJECTS, StateLayout
+from fusion.so3_kernels import copy
 
 Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -36,7 +37,7 @@ def propagate_between(
     """Carry a state x from `start` through stamps (N,): core (N, 21), F and Q (N, 15, 15) from x on."""
     m = views(floats, integers)
     w = work_views(m.work, len(m.P))
-    m.x[:OBJECTS] = x[:OBJECTS]
+    copy(x, m.x[:OBJECTS])
     m.P[:, :] = 0.0
     for i in range(CORE):
         m.P[i, CORE + i] = m.P[CORE + i, i] = 1.0
@@ -44,9 +45,10 @@ def propagate_between(
     m.counters[IMU_AT] = np.searchsorted(imu_stamps, start, side="right") - 1
     for row in range(len(stamps)):
         advance(m, w, imu_stamps, imu_values, stamps[row])
-        core[row] = m.x[:EXTRINSIC_ROTATION]
-        F[row] = m.P[:CORE, CORE : 2 * CORE]
-        Q[row] = m.P[:CORE, :CORE]
+        copy(m.x, core[row])
+        for i in range(CORE):
+            copy(m.P[i, CORE:], F[row, i])
+            copy(m.P[i], Q[row, i])
 
 
 class Between:

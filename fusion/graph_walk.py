@@ -19,6 +19,7 @@ from fusion.memory import MODE, NOW, REPLACED, RESTARTS, TRACKING, Memory, views
 from fusion.nav_state import AT_BIASES, N_BIAS_KINDS, N_OBJECTS, Array, Ints
 from fusion.options import FuseOptions
 from fusion.prepare import Problem, fill_memory
+from fusion.so3_kernels import copy
 
 # Places in the cursor: next IMU row, next measurement, rows written, stamp of the newest keyframe.
 IMU_ROW, NEXT, ROWS, KEYFRAME_NS, CURSOR_SIZE = range(5)
@@ -74,7 +75,8 @@ def filter_until_keyframe(
             _write_row(m, cursor, rows)
             for i in range(j, last):
                 read_fitted(m, w, log, i)
-                fitted_rotations[i], fitted_covariances[i] = w.measured[0:9], w.R
+                copy(w.measured, fitted_rotations[i])
+                copy(w.R.reshape(36), fitted_covariances[i].reshape(36))
             jumped = _find_fresh(m, fresh)
             if not tracked or m.counters[RESTARTS] + m.counters[REPLACED] != restarts:
                 cursor[KEYFRAME_NS] = m.counters[NOW]

@@ -19,7 +19,6 @@ from fusion.memory import (
     IMU_AT,
     LAST_STAMP,
     LEAST_DELAY,
-    N_COUNTERS,
     NOW,
     VOTE_HEAD,
     VOTES,
@@ -53,7 +52,7 @@ from fusion.replay_memory import (
     Ring,
     ring_views,
 )
-from fusion.so3_kernels import from_quaternion
+from fusion.so3_kernels import copy, from_quaternion
 
 IMU_SAMPLE, POSES = 0, 1
 
@@ -103,9 +102,9 @@ def _put_sample(r: Ring, m: Memory, stamp: int, in_the_past: bool) -> bool:
         return False
     for i in range(h[IMU_COUNT], at, -1):
         r.imu_stamps[i] = r.imu_stamps[i - 1]
-        r.imu_values[i] = r.imu_values[i - 1]
+        copy(r.imu_values[i - 1], r.imu_values[i])
     r.imu_stamps[at] = stamp
-    r.imu_values[at, :6] = r.sample
+    copy(r.sample, r.imu_values[at, :6])
     h[IMU_COUNT] += 1
     follow_noise(r.imu_stamps, r.imu_values, at, h[IMU_COUNT])
     return True
@@ -147,11 +146,9 @@ def _put_pose(r: Ring, stamp: int, i: int) -> bool:
     for j in range(h[COUNT], at, -1):
         _copy_pose(r, j - 1, j)
     r.stamps[at], r.kinds[at], r.objects[at] = stamp, r.new_kinds[i], r.new_objects[i]
-    r.rotations[at], r.translations[at], r.covariances[at] = (
-        r.new_rotations[i],
-        r.new_translations[i],
-        r.new_covariances[i],
-    )
+    copy(r.new_rotations[i], r.rotations[at])
+    copy(r.new_translations[i], r.translations[at])
+    _copy_covariance(r.new_covariances[i], r.covariances[at])
     r.decisions[at] = 0
     h[COUNT] += 1
     return True
@@ -161,8 +158,16 @@ def _put_pose(r: Ring, stamp: int, i: int) -> bool:
 def _copy_pose(r: Ring, source: int, target: int) -> None:
     r.stamps[target], r.kinds[target], r.objects[target] = r.stamps[source], r.kinds[source], r.objects[source]
     r.decisions[target] = r.decisions[source]
-    r.rotations[target], r.translations[target] = r.rotations[source], r.translations[source]
-    r.covariances[target], r.nis[target] = r.covariances[source], r.nis[source]
+    copy(r.rotations[source], r.rotations[target])
+    copy(r.translations[source], r.translations[target])
+    _copy_covariance(r.covariances[source], r.covariances[target])
+    copy(r.nis[source], r.nis[target])
+
+
+@njit(cache=True)
+def _copy_covariance(source: Array, target: Array) -> None:
+    for row in range(6):
+        copy(source[row], target[row])
 
 
 @njit(cache=True)
@@ -221,7 +226,7 @@ def _forget_samples(r: Ring, m: Memory) -> None:
     oldest = max(0, oldest - REACH)
     for i in range(oldest, h[IMU_COUNT]):
         r.imu_stamps[i - oldest] = r.imu_stamps[i]
-        r.imu_values[i - oldest] = r.imu_values[i]
+        copy(r.imu_values[i], r.imu_values[i - oldest])
     h[IMU_COUNT] -= oldest
     h[DROPPED] = 1
     m.counters[IMU_AT] -= oldest
@@ -252,13 +257,9 @@ def _take_snapshot(m: Memory, r: Ring, floats: Array) -> None:
         h[FIRST_SNAPSHOT] += 1
     s = h[END_SNAPSHOT] % h[SNAPSHOTS]
     h[END_SNAPSHOT] += 1
-    state, used, size = r.snapshot_states[s], r.snapshot_used[s], h[STATE_SIZE]
-    for i in range(size):
-        state[i] = floats[i]
-    for i in range(VOTES):
-        used[i] = m.used[i]
-    for i in range(N_COUNTERS):
-        r.snapshot_counters[s, i] = m.counters[i]
+    copy(floats, r.snapshot_states[s])
+    copy(m.used, r.snapshot_used[s])
+    copy(m.counters, r.snapshot_counters[s])
 
 
 @njit(cache=True)
@@ -271,18 +272,17 @@ def _rewind(m: Memory, r: Ring, floats: Array, stamp: int, what: int) -> None:
             break
         h[END_SNAPSHOT] -= 1
     if h[END_SNAPSHOT] == h[FIRST_SNAPSHOT]:
-        floats[: h[STATE_SIZE]] = r.first_state
+        copy(r.first_state, floats[: h[STATE_SIZE]])
         m.counters[:] = 0
         h[BEGUN] = h[NEXT] = 0
         return
     s = (h[END_SNAPSHOT] - 1) % h[SNAPSHOTS]
-    floats[: h[STATE_SIZE]] = r.snapshot_states[s]
-    m.counters[:] = r.snapshot_counters[s]
+    copy(r.snapshot_states[s], floats[: h[STATE_SIZE]])
+    copy(r.snapshot_counters[s], m.counters)
     for vote in range(head - 1, m.counters[VOTE_HEAD] - 1, -1):
-        m.votes[vote % VOTES] = r.overwritten[vote % h[CAPACITY]]
+        copy(r.overwritten[vote % h[CAPACITY]], m.votes[vote % VOTES])
         m.vote_stamps[vote % VOTES] = r.overwritten_stamps[vote % h[CAPACITY]]
-    for i in range(VOTES):  # a restart marks old votes as used, so marks are kept beside the votes
-        m.used[i] = r.snapshot_used[s, i]
+    copy(r.snapshot_used[s], m.used)  # a restart marks old votes as used, so marks are kept beside the votes
     h[NEXT] = h[COUNT]
     while h[NEXT] > 0 and r.stamps[h[NEXT] - 1] > m.counters[LAST_STAMP]:
         h[NEXT] -= 1
@@ -318,7 +318,7 @@ def _measure_until(m: Memory, w: Work, r: Ring, until: int) -> None:
         last = end_of_stamp(r.stamps, h[NEXT], h[COUNT])
         for vote in range(m.counters[VOTE_HEAD], m.counters[VOTE_HEAD] + last - h[NEXT]):
             place, slot = vote % h[CAPACITY], vote % VOTES
-            r.overwritten[place] = m.votes[slot]
+            copy(m.votes[slot], r.overwritten[place])
             r.overwritten_stamps[place] = m.vote_stamps[slot]
         measured = (r.stamps, r.kinds, r.objects, r.rotations, r.translations, r.covariances, r.decisions, r.nis)
         h[NEXT] = measure_at(m, w, Columns(r.imu_stamps, r.imu_values, *measured), h[NEXT], last)

@@ -18,6 +18,13 @@ _SMALL = 1e-4
 
 
 @njit(cache=True)
+def copy(source: Array, target: Array) -> None:
+    """Write as many numbers as target has; numba's assignment of slices compiles a message for sizes that differ."""
+    for i in range(len(target)):
+        target[i] = source[i]
+
+
+@njit(cache=True)
 def exp_so3(vx: float, vy: float, vz: float, out: Array) -> None:
     """Write Exp of a rotation vector (rad) into out (9,)."""
     angle2 = vx * vx + vy * vy + vz * vz

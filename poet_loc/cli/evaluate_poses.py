@@ -12,7 +12,8 @@ import tyro
 from poet_loc.cli.arguments import Flat
 from poet_loc.cli.terminal import print_tables
 from poet_loc.io.whole_folder import whole_folder
-from poet_loc.report.pose_evaluation import EvaluatePosesOptions, evaluate_poses
+from poet_loc.report.pose_evaluation import evaluate_poses
+from poet_loc.report.pose_inputs import EvaluatePosesOptions
 from poet_loc.report.pose_tables import pose_tables
 
 

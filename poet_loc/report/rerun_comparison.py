@@ -14,8 +14,9 @@ from rerun.chunk import Chunk, RrdReader
 
 from poet_loc.core.input_error import InputError
 from poet_loc.report.evaluate import ERROR_AXES
-from poet_loc.report.rerun_log import PALETTE, rank
+from poet_loc.report.rerun_log import PALETTE
 from poet_loc.report.rerun_log_images import image_view
+from poet_loc.report.rerun_log_layout import rank
 from poet_loc.report.rerun_log_time import TIMELINE
 
 _OF_ESTIMATES = ("world/estimates/", "world/landmarks_found/", "states/", "consistency/", "decisions/")

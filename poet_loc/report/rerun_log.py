@@ -8,11 +8,9 @@ from __future__ import annotations
 import itertools
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import rerun as rr
-import rerun.blueprint as rrb
 from numpy.typing import NDArray
 from scipy.spatial.transform import RigidTransform, Rotation
 
@@ -20,8 +18,9 @@ from poet_loc.core.records import Camera, LandmarkMap
 from poet_loc.core.trajectory import Trajectory
 from poet_loc.report.evaluate import ERROR_AXES, Body, Estimate, Row
 from poet_loc.report.fused import Fused
-from poet_loc.report.rerun_log_images import image_view, log_images
-from poet_loc.report.rerun_log_time import TIMELINE, time_column
+from poet_loc.report.rerun_log_images import log_images
+from poet_loc.report.rerun_log_layout import UNITS, in_unit, layout_of
+from poet_loc.report.rerun_log_time import time_column
 from poet_loc.report.run_record import DECISIONS, Decisions, RunRecord
 
 Array = NDArray[np.float64]
@@ -45,7 +44,6 @@ PALETTE: tuple[Colour, ...] = (
 )  # Okabe and Ito (2008)
 _DECISION_COLOURS = (0xD55E00FF, 0xE69F00FF, 0xCC79A7FF, 0x0072B2FF)
 _NOT_SEEN = "not seen"
-_UNITS = ("mm", "mm", "mm", "deg", "deg", "deg")
 
 
 def write_recording(record: RunRecord, path: str | Path, name: str = "poet-loc") -> None:
@@ -56,7 +54,7 @@ def write_recording(record: RunRecord, path: str | Path, name: str = "poet-loc")
     """
     recording = rr.RecordingStream("poet-loc")
     with recording:
-        recording.save(path, default_blueprint=_blueprint(record))
+        recording.save(path, default_blueprint=layout_of(record))
         recording.send_recording_name(name)
         recording.log("world", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
         if record.landmark_map is not None and len(record.landmark_map):
@@ -168,17 +166,17 @@ def _log_errors(recording: rr.RecordingStream, row: Row, colour: Colour) -> None
     """Each axis's error as a line, its 3-sigma as a band about zero, and the NEES."""
     step = _step(row.stamps_ns)
     time = time_column(row.stamps_ns[::step])
-    for axis, unit, error in zip(ERROR_AXES, _UNITS, row.errors[::step].T, strict=True):
+    for axis, unit, error in zip(ERROR_AXES, UNITS, row.errors[::step].T, strict=True):
         entity = f"errors/{axis}/{row.name}"
         style = rr.SeriesLines(colors=colour, names=f"{row.name} [{unit}]", widths=1.5)
         recording.log(entity, style, static=True)
-        recording.send_columns(entity, [time], rr.Scalars.columns(scalars=_in_unit(error, unit)))
+        recording.send_columns(entity, [time], rr.Scalars.columns(scalars=in_unit(error, unit)))
     if row.sigmas is not None:
         # rerun draws one standard deviation: nine times the variance makes it three
         bounds = 9.0 * row.sigmas[::step] ** 2
-        for axis, unit, bound in zip(ERROR_AXES, _UNITS, bounds.T, strict=True):
+        for axis, unit, bound in zip(ERROR_AXES, UNITS, bounds.T, strict=True):
             entity = f"errors/{axis}/{row.name}/3_sigma"
-            variances = _in_unit(_in_unit(bound, unit), unit)
+            variances = in_unit(in_unit(bound, unit), unit)
             name = f"±3σ [{unit}]"
             _send_measurements(recording, entity, time, np.zeros((len(bound), 1)), variances[:, None], [name], [colour])
     if row.nees is not None:
@@ -239,86 +237,6 @@ def _log_detections(recording: rr.RecordingStream, record: RunRecord) -> None:
     columns = rr.Points3D.columns(positions=detections.T_cam_obj.translation, colors=colours.astype(np.uint8))
     recording.log(entity, rr.Points3D.from_fields(radii=rr.Radius.ui_points(3.0)), static=True)
     recording.send_columns(entity, [time_column(stamps_ns)], columns.partition(counts))
-
-
-def _blueprint(record: RunRecord) -> rrb.Blueprint:
-    names = sorted((estimate.name for estimate in record.estimates), key=rank)
-    hidden = [name for name in names[1:] if name.startswith("localize/") and name != "localize/robust"]
-    world = rrb.Spatial3DView(
-        origin="world",
-        name="world",
-        overrides={f"world/estimates/{name}": rrb.EntityBehavior(visible=False) for name in hidden},
-        line_grid=rrb.LineGrid3D(spacing=0.1),
-        eye_controls=_eye(record),
-    )
-    rows = sorted(record.evaluation.rows if record.evaluation else (), key=lambda row: rank(row.name))
-    tabs: list[Any] = []
-    if rows:
-        tabs.append(_error_views(rows, ERROR_AXES[:3], "position error"))
-        tabs.append(_error_views(rows, ERROR_AXES[3:], "attitude error"))
-    for fused in sorted(record.fused, key=lambda fused: rank(fused.name)):
-        states = ("gyroscope_bias", "accelerometer_bias", "velocity")
-        views = [rrb.TimeSeriesView(origin=f"states/{fused.name}/{state}", name=state) for state in states]
-        tabs.append(rrb.Vertical(*views, name=f"states of {fused.name}"))
-    consistent = {row.name for row in rows if row.nees is not None and row.name not in hidden}
-    consistent |= {fused.name for fused in record.fused if fused.gate is not None}
-    views = [
-        rrb.TimeSeriesView(origin=f"consistency/{name}", name=name, axis_y=rrb.ScalarAxis(range=(0.0, 8.0)))
-        for name in names
-        if name in consistent
-    ]
-    tabs += [rrb.Vertical(*views, name="consistency")] if views else []
-    lanes = [
-        rrb.StateTimelineView(origin=f"decisions/{name}", name=f"used by {name}")
-        for name in sorted(record.decisions, key=rank)
-    ]
-    column = [rrb.Tabs(*part) for part in (tabs, lanes) if part]
-    shares = [2, 1][: len(column)]
-    space: Any = world
-    if record.images is not None:
-        space = rrb.Vertical(world, image_view(), row_shares=[3, 2])
-    layout = rrb.Horizontal(space, rrb.Vertical(*column, row_shares=shares), column_shares=[3, 2]) if column else space
-    return rrb.Blueprint(layout, rrb.TimePanel(timeline=TIMELINE, expanded=False), collapse_panels=True)
-
-
-def rank(name: str) -> tuple[bool, bool, bool]:
-    """Estimates in the order of interest: fused before localised, tightly coupled and robust ones first."""
-    return name.startswith("localize/"), not name.endswith(("/objects", "/robust")), name == "localize/best"
-
-
-def _eye(record: RunRecord) -> rrb.EyeControls3D | None:
-    """Look down on landmarks and paths from aside."""
-    paths = [*record.references.values()] or [estimate.trajectory for estimate in record.estimates]
-    points = [np.asarray(path.T_world_body.translation) for path in paths if len(path)]
-    points += [landmark.T_world_obj.translation[None] for landmark in record.landmark_map or ()]
-    if not points:
-        return None
-    low, high = np.concatenate(points).min(axis=0), np.concatenate(points).max(axis=0)
-    centre, extent = (low + high) / 2, float(np.linalg.norm(high - low)) + 0.2
-    position = centre + extent * np.array([-0.45, -0.6, 0.5])
-    return rrb.EyeControls3D(position=position, look_target=centre, eye_up=(0.0, 0.0, 1.0))
-
-
-def _error_views(rows: Sequence[Row], axes: Sequence[str], name: str) -> rrb.Vertical:
-    """The first row with its band and the robust localisation as a line; the others are a click away."""
-    first, others = rows[0], [row.name for row in rows[1:]]
-    views = []
-    for axis in axes:
-        hidden = [f"{other}/3_sigma" if other == "localize/robust" else other for other in others]
-        k = ERROR_AXES.index(axis)
-        usual = [np.percentile(np.abs(first.errors[:, k]), 99)] if len(first.errors) else [1e-3]
-        if first.sigmas is not None and np.isfinite(first.sigmas[:, k]).any():
-            usual.append(3.0 * np.nanmedian(first.sigmas[:, k]))
-        limit = 1.5 * float(_in_unit(np.max(usual), _UNITS[k]))
-        view = rrb.TimeSeriesView(
-            origin=f"errors/{axis}",
-            name=f"{axis} and ±3σ of {first.name}",
-            axis_y=rrb.ScalarAxis(range=(-limit, limit)),
-            plot_legend=rrb.PlotLegend(corner=rrb.Corner2D.LeftTop, visible=axis == axes[0]),
-            overrides={f"errors/{axis}/{entity}": rrb.EntityBehavior(visible=False) for entity in hidden},
-        )
-        views.append(view)
-    return rrb.Vertical(*views, name=name)
 
 
 def _send_measurements(
@@ -390,10 +308,6 @@ def _step(stamps_ns: Stamps) -> int:
         return 1
     interval_s = float(np.median(np.diff(stamps_ns))) * 1e-9
     return max(1 + (len(stamps_ns) - 1) // MAX_ROWS, int(1.001 / (MAX_RATE_HZ * interval_s)) if interval_s else 1, 1)
-
-
-def _in_unit(values: Any, unit: str) -> Array:
-    return np.asarray(values * 1e3 if unit == "mm" else np.degrees(values))
 
 
 def _colours(estimates: Sequence[Estimate]) -> dict[str, Colour]:

@@ -16,13 +16,8 @@ from poet_loc.io.bop_models import BopModel
 from poet_loc.io.bop_results_csv import BopResults, write_bop_results
 from poet_loc.io.ply import read_model_points
 from poet_loc.io.poet_results import PoetResults, write_poet_results
-from poet_loc.report.pose_evaluation import (
-    EvaluatePosesOptions,
-    ObjectModel,
-    class_errors,
-    evaluate_poses,
-    overall_errors,
-)
+from poet_loc.report.pose_evaluation import class_errors, evaluate_poses, overall_errors
+from poet_loc.report.pose_inputs import EvaluatePosesOptions, ObjectModel
 from poet_loc.report.pose_tables import pose_tables
 
 CAMERA = np.array([[100.0, 0, 64], [0, 100.0, 48], [0, 0, 1]])

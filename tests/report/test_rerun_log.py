@@ -18,8 +18,8 @@ from scipy.spatial.transform import Rotation
 
 from poet_loc.core.geometry import make_pose
 from poet_loc.core.records import LandmarkMap
-from poet_loc.report import rerun_log
-from poet_loc.report.run_record import RunRecord
+from poet_loc.report import rerun_log, rerun_log_time
+from poet_loc.report.run_record import DECISIONS, RunRecord
 
 AXES = ("x", "y", "z", "yaw", "roll", "pitch")
 NAMES = ("localize/best", "localize/robust", "fuse/eskf/objects")
@@ -49,7 +49,7 @@ def having(chunks: list[Chunk], archetype: str) -> list[Chunk]:
 
 
 def stamps_of(chunks: list[Chunk]) -> np.ndarray:
-    return np.array(column(chunks, rerun_log.TIMELINE).cast("int64"))
+    return np.array(column(chunks, rerun_log_time.TIMELINE).cast("int64"))
 
 
 @pytest.fixture(scope="module")
@@ -98,7 +98,7 @@ def test_time_is_the_sensors_to_the_nanosecond(run_record: RunRecord, chunks: di
     np.testing.assert_array_equal(stamps_of(poses), run_record.references["cam"].stamps_ns)
     for parts in chunks.values():
         for chunk in parts:
-            assert chunk.is_static or chunk.timeline_names == [rerun_log.TIMELINE]
+            assert chunk.is_static or chunk.timeline_names == [rerun_log_time.TIMELINE]
 
 
 def test_cameras_show_from_the_first_pose_on(run_record: RunRecord, chunks: dict[str, list[Chunk]]) -> None:
@@ -140,7 +140,7 @@ def test_detections_hang_on_the_true_camera(run_record: RunRecord, chunks: dict[
 def test_lanes_change_where_the_decisions_do() -> None:
     stamps = np.array([0, 33, 66, 99, 300, 333], dtype=np.int64)
     at, states = rerun_log._changes(stamps, np.array([3, 3, 0, 3, 3, 3]))
-    not_seen = len(rerun_log.DECISIONS)
+    not_seen = len(DECISIONS)
     assert list(zip(at.tolist(), states.tolist(), strict=True)) == [
         (0, 3),
         (66, 0),

@@ -17,7 +17,8 @@ from poet_loc.core.symmetric_errors import RECALL_SHARES
 from poet_loc.data.world.rasterizer import distance_image
 from poet_loc.io.bop_results_csv import BopResults, write_bop_results
 from poet_loc.io.ply import read_model_mesh
-from poet_loc.report.pose_evaluation import EvaluatePosesOptions, evaluate_poses
+from poet_loc.report.pose_evaluation import evaluate_poses
+from poet_loc.report.pose_inputs import EvaluatePosesOptions
 from poet_loc.report.pose_tables import pose_tables
 from poet_loc.report.visible_surface import VisibleSurface
 
