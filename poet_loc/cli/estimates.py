@@ -10,6 +10,7 @@ from fusion.options import FuseOptions
 from fusion.result import FuseResult
 from landmarks.localize import LocalizeOptions, LocalizeResult, localize
 from landmarks.options import MODES, ORACLES, Mode, SolverOptions
+from poet_loc.check.units import check_accelerometer, check_gyroscope
 from poet_loc.cli.terminal import Report
 from poet_loc.core.input_error import InputError
 from poet_loc.core.records import CameraPoses
@@ -104,6 +105,9 @@ def estimate_log(
         report.note(f"{log.path}: no imu.csv: fused on {fused[0].motion.replace('-', ' ')} instead")
     for result in fused:
         _tell_of_moved_objects(log, result, report)
+    if any(result.motion in ("imu", "imu+odometry") for result in fused):
+        for finding in check_gyroscope(log):
+            report.note(f"{log.path / finding.file}: {finding.what}; {finding.fix}")
     evaluation = evaluate_estimates(log, name, _estimates(log, localized, fused), options.evaluation, report)
     return Estimates(log, name, localized, fused, evaluation)
 
@@ -192,9 +196,18 @@ def _fused(
             continue
         attempt.report.step(f"fuse {fusion}")
         try:
+            if choice.motion in ("auto", "imu", "imu+odometry"):
+                refuse_other_units(log)
             yield fuse(log, choice, camera_poses=from_solver, object_poses=object_poses)
         except InputError as error:
             attempt.failed(error, f"fuse/{fusion}")
+
+
+def refuse_other_units(log: Log) -> None:
+    """Raise InputError where the IMU's specific force at rest is g in another unit, or none at all."""
+    for finding in check_accelerometer(log):
+        if finding.check in ("accelerometer-unit", "no-gravity"):
+            raise InputError(finding.what, path=log.path / finding.file, fix=finding.fix)
 
 
 def _solved(
