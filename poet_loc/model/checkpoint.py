@@ -75,8 +75,11 @@ def checksum(weights: Mapping[str, Tensor]) -> str:
 
 
 def save_weights(path: str | Path, weights: Mapping[str, Tensor], config: ModelConfig) -> str:
-    """Write weights with their configuration and return their checksum; the file appears whole or not at all."""
-    from safetensors.torch import save_file
+    """Write weights with their configuration and return their checksum; the file appears whole or not at all.
+
+    The same weights and configuration are the same bytes.
+    """
+    from safetensors.torch import save
 
     path = Path(path)
     tensors = {name: tensor.detach().contiguous().cpu() for name, tensor in weights.items()}
@@ -84,9 +87,19 @@ def save_weights(path: str | Path, weights: Mapping[str, Tensor], config: ModelC
     metadata = {"format": FORMAT, "config": json.dumps(config.to_json()), "sha256": digest}
     path.parent.mkdir(parents=True, exist_ok=True)
     unfinished = path.with_name(path.name + ".part")
-    save_file(tensors, unfinished, metadata=metadata)
+    unfinished.write_bytes(_in_order(save(tensors, metadata)))
     unfinished.replace(path)
     return digest
+
+
+def _in_order(data: bytes) -> bytes:
+    """Return a safetensors file with its metadata sorted; the library writes them in an order of chance."""
+    start = 8 + int.from_bytes(data[:8], "little")
+    header = json.loads(data[8:start])
+    header["__metadata__"] = dict(sorted(header["__metadata__"].items()))
+    text = json.dumps(header, separators=(",", ":"), ensure_ascii=False).encode()
+    text += b" " * (-len(text) % 8)
+    return len(text).to_bytes(8, "little") + text + data[start:]
 
 
 def save_model(path: str | Path, network: PoET, config: ModelConfig, half: bool = False) -> str:

@@ -282,3 +282,16 @@ def test_a_file_that_is_there_is_not_replaced_unasked(fixture_a: FixtureA, tmp_p
     assert convert_checkpoint(replace(options, queries=6, overwrite=True)).network.queries == 6
     with pytest.raises(InputError, match="is a folder"):
         convert_checkpoint(replace(options, target=tmp_path))
+
+
+def test_the_same_weights_are_the_same_bytes(tmp_path: Path) -> None:
+    weights = {"a": torch.arange(6.0).reshape(2, 3), "b": torch.ones(2, dtype=torch.int64)}
+    config = ModelConfig(small_options())
+    files = set()
+    for number in range(8):  # the order of three entries differs from call to call, if left to chance
+        save_weights(tmp_path / f"{number}.safetensors", weights, config)
+        files.add((tmp_path / f"{number}.safetensors").read_bytes())
+    assert len(files) == 1
+    read, read_config = read_weights(tmp_path / "0.safetensors")
+    assert read_config == config
+    assert all(torch.equal(read[name], tensor) for name, tensor in weights.items())
