@@ -16,7 +16,8 @@ import math
 
 from fusion.compiled import njit
 from fusion.nav_state import Array, Ints
-from fusion.so3_kernels import apply, exp_so3, log_so3, multiply, multiply_transposed_left, multiply_transposed_right
+from fusion.so3_kernels import apply, multiply
+from fusion.start_fit import AT_ITS_PLACE, WHOLE, fit_correction, shift_of
 from fusion.votes import (
     VOTE_ARM,
     VOTE_DISTANCE,
@@ -48,24 +49,6 @@ from fusion.votes import (
     LEAD,
 ) = range(16)
 
-AT_ITS_PLACE, WHOLE = 1, 2  # what of a vote agrees
-
-
-@njit(cache=True)
-def _shift(votes: Array, i: int, C: Array, origin: Array, gravity: Array, since: float, out: Array) -> None:
-    """Write where a correction C puts the displacement that the integrated motion had at vote i.
-
-    origin holds position and velocity that are taken off the integrated motion: what it got wrong may be large.
-    Integrated under a tilted gravity, it is off by (g - C g) t^2 / 2 beside that.
-    """
-    x = votes[i, 21] - origin[0] - since * origin[3]
-    y = votes[i, 22] - origin[1] - since * origin[4]
-    z = votes[i, 23] - origin[2] - since * origin[5]
-    apply(C, x, y, z, out)
-    for j in range(3):
-        turned = C[3 * j] * gravity[0] + C[3 * j + 1] * gravity[1] + C[3 * j + 2] * gravity[2]
-        out[j] += 0.5 * (gravity[j] - turned) * since * since
-
 
 @njit(cache=True)
 def _offset(
@@ -75,7 +58,7 @@ def _offset(
     turned, arm = scratch[0:9], scratch[9:12]
     multiply(C, votes[i, 12:21], turned)
     apply(turned, votes[i, VOTE_ARM], votes[i, VOTE_ARM + 1], votes[i, VOTE_ARM + 2], arm)
-    _shift(votes, i, C, origin, gravity, since, d)
+    shift_of(votes, i, C, origin, gravity, since, d)
     for j in range(3):
         d[j] = votes[i, VOTE_PLACE + j] - arm[j] - d[j]
 
@@ -112,7 +95,7 @@ def _agree(
     """
     turned, shift, fitted = scratch[0:9], scratch[9:12], scratch[12:24]
     multiply(C, votes[i, 12:21], turned)
-    _shift(votes, i, C, origin, gravity, since, shift)
+    shift_of(votes, i, C, origin, gravity, since, shift)
     arm, agrees, support, total = scratch[24:27], 0, 0.0, 0.0
     apply(turned, votes[i, VOTE_ARM], votes[i, VOTE_ARM + 1], votes[i, VOTE_ARM + 2], arm)
     for j in range(3):
@@ -156,8 +139,8 @@ def largest_agreement(
     and in half as many as a start needs.
 
     votes is a ring whose entries first..head-1 (modulo its length, a power of two) count; inlier (ring length) marks
-    those that agree. origin (6,) is the position and velocity that the correction replaces; v is fitted to the agreeing
-    votes, so that at stamp `now` position and velocity become d and v. scratch holds 224 floats.
+    what of each agrees. origin (6,) is the position and velocity that the correction replaces; v is fitted to the
+    agreeing votes, so that at stamp `now` position and velocity become d and v. scratch holds 224 floats.
     """
     mask, cosine = len(stamps) - 1, math.cos(options[MAX_ANGLE])
     seed = _search(
@@ -183,7 +166,7 @@ def largest_agreement(
         if k >= 0:
             seen[k & 31] += 1.0
             at_place[k & 31] += agrees & AT_ITS_PLACE
-        if inlier[j]:
+        if inlier[j] & what:
             count, oldest, newest = count + 1, min(oldest, stamps[j]), max(newest, stamps[j])
     for k in range(32):
         objects += at_place[k] >= 0.5 * max(options[MIN_VOTES], seen[k])
@@ -341,7 +324,7 @@ def _mark(
 ) -> float:
     """Return how much votes support the correction of one of them, which knows no velocity yet (seed -1: it does).
 
-    Stops where the sum cannot exceed `least` any more; what: mark the votes of which so much agrees (0: none).
+    Stops where the sum cannot exceed `least` any more; what: 0, or else mark what of each vote agrees.
     """
     support, cosine = 0.0, math.cos(options[MAX_ANGLE])
     for b in range(first, head):
@@ -354,7 +337,7 @@ def _mark(
         agrees, well = _agree(votes, j, C, d, v, origin, gravity, (stamps[j] - now) * 1e-9, cosine, reach, scratch)
         support += well
         if what > 0:
-            inlier[j] = agrees & what != 0
+            inlier[j] = agrees
     return support
 
 
@@ -376,111 +359,13 @@ def _refine(
     inlier: Ints,
     scratch: Array,
 ) -> None:
-    """Average the agreeing votes' corrections, fit offset and velocity to them, and choose them anew."""
-    mask, cosine = len(stamps) - 1, math.cos(options[MAX_ANGLE])
-    vector, mean, turn, shift, other = scratch[48:51], scratch[51:54], scratch[54:63], scratch[63:66], scratch[66:75]
-    turned, fitted, count, telling = scratch[75:84], scratch[84:96], 0, 0
-    mean[0] = mean[1] = mean[2] = 0.0
-    for a in range(first, head):
-        i = a & mask
-        if inlier[i]:
-            multiply(C, votes[i, 12:21], turned)
-            fit_vote(votes[i], turned, fitted, scratch)
-            multiply_transposed_right(fitted, votes[i, 12:21], other)
-            multiply_transposed_left(C, other, turn)
-            log_so3(turn, vector)
-            count += 1
-            telling += votes[i, VOTE_ORDER] > 0.0
-            for j in range(3):
-                mean[j] += vector[j]
-    if count == 0:
-        return
-    by_places = what == AT_ITS_PLACE
-    if by_places:
-        _level(C, up, scratch[48:96])
-    else:
-        exp_so3(mean[0] / count, mean[1] / count, mean[2] / count, turn)
-        multiply(C, turn, other)
-        for j in range(9):
-            C[j] = other[j]
-    if by_places or (telling < options[MIN_VOTES] and up[0] ** 2 + up[1] ** 2 + up[2] ** 2 > 0.0):
-        _turn_to_places(votes, stamps, first, head, now, origin, gravity, C, v, inlier, scratch)
-    # Offset and missing velocity: ridge regression, a velocity counts as MAX_SPEED, a vote as a third of MAX_DISTANCE.
-    ridge = (options[MAX_DISTANCE] / 3.0 / options[MAX_SPEED]) ** 2
-    for j in range(3):
-        sw, st, stt, sy, sty = 0.0, 0.0, ridge, 0.0, 0.0
-        for a in range(first, head):
-            i = a & mask
-            if inlier[i]:
-                t = (stamps[i] - now) * 1e-9
-                _shift(votes, i, C, origin, gravity, t, shift)
-                multiply(C, votes[i, 12:21], turned)
-                fit_vote(votes[i], turned, fitted, scratch)
-                y = fitted[9 + j] - shift[j]
-                if by_places:
-                    apply(turned, votes[i, VOTE_ARM], votes[i, VOTE_ARM + 1], votes[i, VOTE_ARM + 2], vector)
-                    y = votes[i, VOTE_PLACE + j] - vector[j] - shift[j]
-                sw, st, stt, sy, sty = sw + 1.0, st + t, stt + t * t, sy + y, sty + t * y
-        determinant = sw * stt - st * st
-        d[j] = (stt * sy - st * sty) / determinant
-        v[j] = (sw * sty - st * sy) / determinant
-    for a in range(first, head):
-        i = a & mask
-        reach = options[MAX_DISTANCE] + options[MAX_LEVER] * votes[i, VOTE_DISTANCE]
-        agrees, _ = _agree(votes, i, C, d, v, origin, gravity, (stamps[i] - now) * 1e-9, cosine, reach, scratch)
-        inlier[i] = agrees & what != 0
-
-
-@njit(cache=True)
-def _level(C: Array, up: Array, scratch: Array) -> None:
-    """Turn a correction, by as little as it takes, so that up becomes z."""
-    u, turn, turned = scratch[0:3], scratch[3:12], scratch[12:21]
-    apply(C, up[0], up[1], up[2], u)
-    sine = math.sqrt(u[0] ** 2 + u[1] ** 2)
-    angle = math.atan2(sine, u[2]) / sine if sine > 0.0 else 0.0
-    exp_so3(angle * u[1], -angle * u[0], 0.0, turn)
-    multiply(turn, C, turned)
-    for j in range(9):
-        C[j] = turned[j]
-
-
-@njit(cache=True)
-def _turn_to_places(
-    votes: Array,
-    stamps: Ints,
-    first: int,
-    head: int,
-    now: int,
-    origin: Array,
-    gravity: Array,
-    C: Array,
-    v: Array,
-    inlier: Ints,
-    scratch: Array,
-) -> None:
-    """Turn a correction about the vertical to where the agreeing votes' objects fit their places best."""
-    shift, arm, turned, sums = scratch[63:66], scratch[51:54], scratch[75:84], scratch[84:96]
-    sums[:] = 0.0
+    """Fit the correction to the votes that agree, and choose these anew."""
+    fit_correction(
+        votes, stamps, first, head, now, up, origin, gravity, options[MAX_SPEED], options[MAX_TILT], C, d, v, inlier
+    )
+    cosine = math.cos(options[MAX_ANGLE])
     for a in range(first, head):
         i = a & (len(stamps) - 1)
-        if inlier[i]:
-            since = (stamps[i] - now) * 1e-9
-            _shift(votes, i, C, origin, gravity, since, shift)
-            multiply(C, votes[i, 12:21], turned)
-            apply(turned, votes[i, VOTE_ARM], votes[i, VOTE_ARM + 1], votes[i, VOTE_ARM + 2], arm)
-            x, y = shift[0] + v[0] * since + arm[0], shift[1] + v[1] * since + arm[1]
-            p, q = votes[i, VOTE_PLACE], votes[i, VOTE_PLACE + 1]
-            sums[0] += 1.0
-            sums[1] += x
-            sums[2] += y
-            sums[3] += p
-            sums[4] += q
-            sums[5] += x * p + y * q
-            sums[6] += x * q - y * p
-    n = max(sums[0], 1.0)
-    along = sums[5] - (sums[1] * sums[3] + sums[2] * sums[4]) / n
-    across = sums[6] - (sums[1] * sums[4] - sums[2] * sums[3]) / n
-    exp_so3(0.0, 0.0, math.atan2(across, along) if along > 0.0 else 0.0, turned)
-    multiply(turned, C, sums[0:9])
-    for j in range(9):
-        C[j] = sums[j]
+        reach = options[MAX_DISTANCE] + options[MAX_LEVER] * votes[i, VOTE_DISTANCE]
+        agrees, _ = _agree(votes, i, C, d, v, origin, gravity, (stamps[i] - now) * 1e-9, cosine, reach, scratch)
+        inlier[i] = agrees

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 
+from fusion.bias_spread import follow_spreads
 from fusion.columns import OUT_CORE, OUT_SIGMA, Columns, Rows
 from fusion.compiled import njit
 from fusion.eskf import ACCEPTED, REJECTED
@@ -145,6 +146,7 @@ def measure(m: Memory, w: Work, log: Columns, first: int, last: int) -> None:
     if poses < last:
         if m.meeting[UNKNOWN_MAP] > 0.0:
             choose_anchor(m, log.kinds, log.objects, poses, last)
+        follow_spreads(m, log, poses, last)
         if c[MODE] == TRACKING:
             _take_poses(m, w, log, poses, last)
             _meet_objects(m, w, log, poses, last)
@@ -235,7 +237,7 @@ def account(m: Memory, w: Work, log: Columns, first: int, last: int) -> None:
     for j in range(first, last):
         kind, k, decision = log.kinds[j], log.objects[j], log.decisions[j]
         follow_jumps(m, log, j)
-        cast_vote(m, w, kind, k, log.rotations[j], log.translations[j], decision)
+        cast_vote(m, w, kind, k, log.rotations[j], log.translations[j], log.covariances[j], decision)
         accepted = accepted or decision & ACCEPTED != 0
         refused += decision == REJECTED
         if c[MODE] == TRACKING:

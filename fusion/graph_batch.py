@@ -76,6 +76,7 @@ def run_batch(problem: Problem, options: FuseOptions) -> FuseResult:
         raise never_started(problem, options)
     chain = MotionChain.of(problem, options)
     builder = GraphBuilder(problem.layout, stretches[0].states[0], walk.memory.bias_model, chain, options.graph)
+    builder.follow_spreads(walk.memory.x)
     for stretch in stretches:
         _approach(stretch, builder, walk, options.graph)
         for again in range(max(1, options.graph.rounds)):

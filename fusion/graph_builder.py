@@ -265,6 +265,11 @@ class GraphBuilder:
             if variable.key not in self._statics:
                 self.x[variable.at : variable.at + OBJECT_SIZE] = x[variable.at : variable.at + OBJECT_SIZE]
 
+    def follow_spreads(self, x: Array) -> None:
+        """Let the objects' biases spread, from here on, as a nominal array of the filter says."""
+        for own in (self.x, self.origin, self.model.x):
+            own[self.layout.spread_start :] = x[self.layout.spread_start :]
+
     def _meet(self, k: int) -> None:
         """Add an object's pose where it is seen for the first time."""
         variable = object_variable(self.layout, k)

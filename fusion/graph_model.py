@@ -21,6 +21,8 @@ from fusion.nav_state import (
     OBJECT_SIZE,
     OBJECTS,
     POSITION,
+    SPREAD_SIZE,
+    SPREADS,
     TIME_OFFSET,
     VELOCITY,
     Array,
@@ -161,7 +163,8 @@ def detection_error(
     """Return predicted minus measured (rows first..first+size of [rotation, translation]) and its Jacobian.
 
     Seen `motion` after the pose (4, 4) with its velocity (3,), at an angular velocity rate (3,); extrinsics and object
-    (4, 4), time offset (s) and biases (kinds, 6) as they are now; x: a nominal array, scratch but for its gravity.
+    (4, 4), time offset (s) and biases (kinds, 6) as they are now; x: a nominal array, scratch but for gravity
+    and spreads.
     Jacobian columns as named above; poses in gtsam's tangent [rotation, translation in body axes].
 
     A bias shifts the position by D(place) b (`measurements`), place (3,) p_cam_obj as it was when the factor was made.
@@ -177,6 +180,9 @@ def detection_error(
     if kind == OBJECT_POSE:
         put(x, OBJECTS + OBJECT_SIZE * k, T_world_obj)
         write_bias_axes(place, axes)
+        spread = layout[SPREADS] + SPREAD_SIZE * k
+        for i in range(9 if len(biases) else 0):
+            axes[i] *= x[spread + (2 if i % 3 == 2 else 1)]
         for i in range(len(biases)):
             at, b = layout[BIASES] + 6 * (k + i * layout[N_OBJECTS]), biases[i]
             for j in range(3):

@@ -70,6 +70,7 @@ class FixedLagSmoother:
         """Begin at a keyframe with the filter's state as prior."""
         m = walk.memory
         self.builder.start(keyframe.stamp_ns, m.x, m.P, m.known)
+        self.builder.follow_spreads(m.x)
         self.builder.add_odometry(odometry_at(walk, keyframe))
         if self.builder.clone < 0:
             m.counters[CLONED] = 0  # a pose that this graph does not have
@@ -79,6 +80,7 @@ class FixedLagSmoother:
         """Add a keyframe and what was measured since the last one; correct the filter's state with the result."""
         builder = self.builder
         builder.place_new_objects(walk.memory.x)
+        builder.follow_spreads(walk.memory.x)
         add_measurements(builder, walk, keyframe.between)
         builder.add_keyframe(keyframe.stamp_ns)
         forget_biases(builder, keyframe)

@@ -42,6 +42,8 @@ from fusion.nav_state import (
     OBJECTS,
     POSITION,
     POSITION_ERROR,
+    SPREAD_SIZE,
+    SPREADS,
     TIME_OFFSET,
     VELOCITY,
     VELOCITY_ERROR,
@@ -341,6 +343,12 @@ def _object_pose(
         b0, b1, b2 = b0 + x[b], b1 + x[b + 1], b2 + x[b + 2]
         c0, c1, c2 = c0 + x[b + 3], c1 + x[b + 4], c2 + x[b + 5]
     write_bias_axes(p_co, axes)
+    turning = across = along = 1.0
+    if layout[N_BIAS_KINDS] > 0:
+        spread = layout[SPREADS] + SPREAD_SIZE * k
+        turning, across, along = x[spread], x[spread + 1], x[spread + 2]
+    b0, b1, b2 = turning * b0, turning * b1, turning * b2
+    c0, c1, c2 = across * c0, across * c1, along * c2
     exp_so3(b0, b1, b2, scratch)
     multiply(scratch, R_co, biased)
     multiply_transposed_right(R_m, biased, block)
@@ -383,6 +391,9 @@ def _object_pose(
             H[5, j] = (1.0 + c2) * h2 - c0 * h0 - c1 * h1
     left_jacobian(b0, b1, b2, 1.0, jacobian)
     multiply(inverse, jacobian, block)
+    for i in range(9):
+        block[i] *= turning
+        axes[i] *= along if i % 3 == 2 else across
     for bias in range(layout[N_BIAS_KINDS]):
         _put(H, 0, bias_start + 6 * bias, 1.0, block)
         _put(H, 3, bias_start + 6 * bias + 3, 1.0, axes)

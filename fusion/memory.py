@@ -60,6 +60,7 @@ SUPPOSED, SUPPOSED_SIZE = 6, 16  # hypotheses of each unknown object's pose, see
     AT_LIMITS,
     AT_START,
     AT_BIAS_MODEL,
+    AT_SPREAD_MODEL,
     AT_MOVED,
     AT_MEETING,
     AT_AXES,
@@ -80,7 +81,7 @@ SUPPOSED, SUPPOSED_SIZE = 6, 16  # hypotheses of each unknown object's pose, see
     AT_TAPE,
     TAPE_SIZE,
     HEADER,
-) = range(34)
+) = range(35)
 
 
 class Memory(NamedTuple):
@@ -99,6 +100,7 @@ class Memory(NamedTuple):
     limits: Array  # places: filter_update.LIMIT_BOTH and following
     start: Array
     bias_model: Array
+    spread_model: Array  # of detections that state no noise: places in bias_spread.py
     moved: Array  # when an object counts as moved: places in place_watch.py
     meeting: Array  # when an object of unknown pose is put where it is seen: places in meeting.py
     axes: Array  # (K, 3) symmetry axes
@@ -135,6 +137,7 @@ def allocate(layout: StateLayout) -> tuple[Array, Ints]:
         (AT_LIMITS, 12),
         (AT_START, 20),
         (AT_BIAS_MODEL, 12),
+        (AT_SPREAD_MODEL, 5),
         (AT_MOVED, 12),
         (AT_MEETING, 8),
         (AT_AXES, 3 * max(K, 1)),
@@ -195,6 +198,7 @@ def views(floats: Array, integers: Ints) -> Memory:
         f[i[AT_LIMITS] : i[AT_LIMITS] + 12],
         f[i[AT_START] : i[AT_START] + 20],
         f[i[AT_BIAS_MODEL] : i[AT_BIAS_MODEL] + 12],
+        f[i[AT_SPREAD_MODEL] : i[AT_SPREAD_MODEL] + 5],
         f[i[AT_MOVED] : i[AT_MOVED] + 12],
         f[i[AT_MEETING] : i[AT_MEETING] + 8],
         f[i[AT_AXES] : i[AT_AXES] + 3 * K].reshape((K, 3)),

@@ -4,7 +4,8 @@ The nominal state is one flat float64 array, so that compiled loops, snapshots a
 
     core       R_world_imu (9, row-major), p_world_imu (3), v_world_imu (3), gyroscope bias (3), accelerometer bias (3)
     beside it  T_imu_cam (9 + 3), time offset (1), gravity in world axes (3), T_world_obj (12) and bias (6) per object,
-               and the clone (12): T_world_imu at the last odometry
+               the clone (12): T_world_imu at the last odometry, and where there are biases, per object how far they
+               spread (4): factors of rotation, across and along the ray, and how many detections these stand on
 
 The error state holds the core's 15 components always, then what is switched on:
 [attitude, position, velocity, gyroscope bias, accelerometer bias | extrinsics 6 | time offset 1 | gravity 2 |
@@ -31,6 +32,7 @@ Ints = NDArray[np.int64]
 ROTATION, POSITION, VELOCITY, GYRO_BIAS, ACCEL_BIAS = 0, 9, 12, 15, 18
 EXTRINSIC_ROTATION, EXTRINSIC_POSITION, TIME_OFFSET, GRAVITY, OBJECTS = 21, 30, 33, 34, 37
 OBJECT_SIZE = 12
+SPREAD_SIZE, SPREAD_COUNT = 4, 3
 
 # Places in the error state.
 ATTITUDE_ERROR, POSITION_ERROR, VELOCITY_ERROR, GYRO_BIAS_ERROR, ACCEL_BIAS_ERROR = 0, 3, 6, 9, 12
@@ -50,8 +52,9 @@ CORE = 15
     BIASES,
     AT_CLONE,
     CLONE,
+    SPREADS,
     LAYOUT_SIZE,
-) = range(13)
+) = range(14)
 
 
 @dataclass(frozen=True)
@@ -91,6 +94,11 @@ class StateLayout:
     @property
     def n_nominal(self) -> int:
         """Size of the nominal array."""
+        return self.spread_start + SPREAD_SIZE * self.n_objects * (self.bias_kinds > 0)
+
+    @property
+    def spread_start(self) -> int:
+        """Where the factors of the objects' biases start in the nominal array."""
         return self.clone_start + 12 * self.clone
 
     @property
@@ -137,6 +145,7 @@ class StateLayout:
                 self.bias_start,
                 starts["clone"],
                 self.clone_start,
+                self.spread_start,
             ],
             dtype=np.int64,
         )
@@ -172,6 +181,8 @@ def nominal_state(
         put_pose(x, OBJECTS + OBJECT_SIZE * k, T_world_obj[k])  # type: ignore[index]
     if layout.clone:
         put_pose(x, layout.clone_start, identity)
+    if layout.bias_kinds:
+        x[layout.spread_start :] = np.tile([1.0, 1.0, 1.0, 0.0], layout.n_objects)
     return x
 
 

@@ -23,6 +23,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from fusion import memory, replay, replay_memory
+from fusion.bias_spread import white_part
 from fusion.health import Mode, ObjectHealth, mode_of
 from fusion.measurements import (
     BEFORE_POSES,
@@ -315,8 +316,9 @@ class Estimator:
         sigma = math.radians(noise.rotation_deg)
         if covariances is None:
             return ray_aligned_covariance(places, noise.across, noise.along, sigma, noise.floor)
-        given = np.asarray(covariances, dtype=float).reshape(len(t), 6, 6)
+        given = np.array(covariances, dtype=float).reshape(len(t), 6, 6)
         stated = np.isfinite(given).all(axis=(1, 2))
+        given[stated] = white_part(given[stated], places[stated], noise, self.options.bias)
         if stated.all():
             return given
         R = ray_aligned_covariance(places, noise.across, noise.along, sigma, noise.floor)

@@ -7,6 +7,7 @@ from poet_loc.core.input_error import InputError, within
 RANGES: dict[str, tuple[str, ...]] = {
     "(0, inf)": (
         "noise.rotation_deg",
+        "noise.stated_scale",
         "camera_noise.position",
         "camera_noise.rotation_deg",
         "camera_noise.solver_scale",
@@ -86,6 +87,7 @@ RANGES: dict[str, tuple[str, ...]] = {
     ),
     "[1, inf]": (
         "bias.jump_after",
+        "noise.stated_over",
         "gate.max_noise_scale",
         "moved.min_poses",
         "meeting.min_poses",

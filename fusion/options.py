@@ -20,6 +20,11 @@ class DetectionNoise:
     """1-sigma of position in every direction beside that, m: what stays of the error near an object."""
     rotation_deg: float = 3.0
     """1-sigma of rotation per axis, deg."""
+    stated_scale: float = 1.2
+    """The 1-sigma that a detection states of itself is taken so many times larger. It is of the whole error: split into
+    white noise and biases by the shares that these options and those of the biases give, object by object."""
+    stated_over: int = 100
+    """So many of an object's detections make the mean by which its biases are larger or smaller than the options'."""
 
 
 @dataclass(frozen=True)
@@ -30,7 +35,7 @@ class CameraNoise:
     """1-sigma of position per axis, m."""
     rotation_deg: float = 2.0
     """1-sigma of rotation per axis, deg."""
-    solver_scale: float = 8.0
+    solver_scale: float = 12.0
     """The 1-sigma of the solver's own poses is taken so many times larger: their errors last for seconds, and a filter
     that takes them for white believes itself by about the square root of twice that time in frames too much."""
 

@@ -14,7 +14,7 @@ from fusion.compiled import njit
 from fusion.eskf import ACCEPTED, POSITION_ONLY, ROTATION_ONLY, cholesky, whiten
 from fusion.measurements import OBJECT_POSE, object_in_world, write_bias_axes
 from fusion.memory import NOW, Memory, Work
-from fusion.nav_state import AT_OBJECTS, N_BIAS_KINDS, OBJECT_SIZE, OBJECTS, TIME_OFFSET, Array
+from fusion.nav_state import AT_OBJECTS, N_BIAS_KINDS, OBJECT_SIZE, OBJECTS, SPREAD_SIZE, SPREADS, TIME_OFFSET, Array
 from fusion.object_biases import bias_sigma
 from fusion.so3_kernels import apply_transposed, log_so3, multiply_transposed_right
 
@@ -188,7 +188,8 @@ def _implausible(m: Memory, w: Work, k: int, first: int) -> bool:
             w.S[first + i, first + j] = w.R[first + i, first + j]
     for kind in range(m.layout[N_BIAS_KINDS]):
         for c in range(3):
-            variance = bias_sigma(m.bias_model, kind, first + c) ** 2
+            spread = m.x[m.layout[SPREADS] + SPREAD_SIZE * k + (0 if first == 0 else 1 + c // 2)]
+            variance = (spread * bias_sigma(m.bias_model, kind, first + c)) ** 2
             if first == 0:
                 w.S[c, c] += variance
                 continue

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fusion import consensus, filter_update, imu, meeting, memory, object_biases, odometry, place_watch
+from fusion.bias_spread import spread_model, white_part
 from fusion.measurements import CAMERA_POSE, OBJECT_POSE, Measurements, ray_aligned_covariance
 from fusion.motion_source import Kind, motion_source, odometry_steps
 from fusion.nav_state import ACCEL_BIAS_ERROR, CORE, GYRO_BIAS_ERROR, VELOCITY_ERROR, StateLayout, nominal_state
@@ -113,7 +114,7 @@ def object_measurements(
     covariances = ray_aligned_covariance(t, noise.across, noise.along, math.radians(noise.rotation_deg), noise.floor)
     if poses.covariances is not None:
         given = np.isfinite(poses.covariances).all(axis=(1, 2))
-        covariances[given] = poses.covariances[given]
+        covariances[given] = white_part(poses.covariances[given], t[given], noise, options.bias)
     return Measurements(
         poses.stamps_ns + time_shift_ns(calibration),
         np.full(len(poses), OBJECT_POSE, dtype=np.int64),
@@ -199,6 +200,7 @@ def fill_memory(problem: Problem, options: FuseOptions) -> tuple[Array, NDArray[
     m.noise[imu.MEASURED] = options.imu.measured and problem.motion in WITH_IMU
     m.limits[: filter_update.SETTLED + 1] = _limits(options)
     m.start[: consensus.LEAD + 1] = _start(options)
+    m.spread_model[:] = spread_model(options.noise)
     m.bias_model[:] = _bias_model(options.bias)
     m.moved[: place_watch.MIN_POSES + 1] = _moved(options)
     m.meeting[: meeting.REPLACE + 1] = _meeting(options)

@@ -14,6 +14,7 @@ from filterpy.kalman import predict, update
 from scipy.spatial.transform import Rotation
 
 from fusion import filter_loop, filter_motion, filter_update, imu, memory, odometry, starting
+from fusion.bias_spread import follow_spreads
 from fusion.columns import OUT_CORE, OUT_SIGMA, Columns, Rows
 from fusion.eskf import ACCEPTED, POSITION_ONLY, REJECTED, ROTATION_ONLY
 from fusion.fuse import run_filter
@@ -263,6 +264,7 @@ class ReferenceFilter:
             return
         if m.meeting[UNKNOWN_MAP]:
             choose_anchor(m, kinds, log.objects, first, last)
+        follow_spreads(m, log, first, last)
         if self.tracking:
             for j in self.order(first, last, log):
                 decisions[j] = self.take(log, j)

@@ -28,6 +28,7 @@ from fusion.nav_state import (
     OBJECT_SIZE,
     OBJECTS,
     POSITION,
+    SPREAD_SIZE,
     TIME_OFFSET,
     VELOCITY,
     Array,
@@ -203,8 +204,12 @@ def object_pose_residual(x: Array, k: int, R_m: Array, t_m: Array, layout: State
     p_co = R_ic.T @ (p_io - p_ic)
     R_wc = R_wi @ R_ic
     R_co = R_wc.T @ R_wo
-    bias = sum((x[layout.nominal_bias(k, kind)] for kind in range(layout.bias_kinds)), start=np.zeros(6))
-    b, c = bias[:3], bias[3:]
+    bias, spread = np.zeros(6), np.ones(6)
+    if layout.bias_kinds:
+        bias = sum((x[layout.nominal_bias(k, kind)] for kind in range(layout.bias_kinds)), start=bias)
+        turning, across, along = x[layout.spread_start + SPREAD_SIZE * k :][:3]
+        spread = np.array([turning, turning, turning, across, across, along])
+    b, c = np.split(spread * bias, 2)
     aside = np.array([-c[1], c[0], 0.0])  # D(p) c = aside x p + c_z p
     D = np.array([[p_co[2], 0.0, p_co[0]], [0.0, p_co[2], p_co[1]], [-p_co[0], -p_co[1], p_co[2]]])
     residual = np.r_[log(R_m @ (exp(b) @ R_co).T), t_m - p_co - D @ c]
@@ -226,8 +231,8 @@ def object_pose_residual(x: Array, k: int, R_m: Array, t_m: Array, layout: State
         H[POSITION_ROWS, at + 3 : at + 6] = stretch @ R_wc.T
     for kind in range(layout.bias_kinds):
         at = layout.error_slice("biases", k, kind).start
-        H[ROTATION_ROWS, at : at + 3] = inverse @ so3_left_jacobian(b)
-        H[POSITION_ROWS, at + 3 : at + 6] = D
+        H[ROTATION_ROWS, at : at + 3] = inverse @ so3_left_jacobian(b) * spread[:3]
+        H[POSITION_ROWS, at + 3 : at + 6] = D * spread[3:]
     return residual, H
 
 

@@ -50,6 +50,8 @@ from fusion.nav_state import (
     OBJECT_SIZE,
     OBJECTS,
     POSITION,
+    SPREAD_SIZE,
+    SPREADS,
     VELOCITY,
     Array,
 )
@@ -63,11 +65,23 @@ from fusion.so3_kernels import (
 from fusion.tape import (
     note_restart,
 )
-from fusion.votes import VOTE_ARM, VOTE_AXIS, VOTE_DISTANCE, VOTE_OBJECT, VOTE_ORDER, VOTE_PLACE
+from fusion.votes import (
+    VOTE_ACROSS,
+    VOTE_ALONG,
+    VOTE_ARM,
+    VOTE_AXIS,
+    VOTE_DISTANCE,
+    VOTE_OBJECT,
+    VOTE_ORDER,
+    VOTE_PLACE,
+    VOTE_TURN,
+)
 
 
 @njit(cache=True)
-def cast_vote(m: Memory, w: Work, kind: int, k: int, rotation: Array, translation: Array, decision: int) -> None:
+def cast_vote(
+    m: Memory, w: Work, kind: int, k: int, rotation: Array, translation: Array, covariance: Array, decision: int
+) -> None:
     """Remember where a measurement puts the imu."""
     if kind == OBJECT_POSE and (m.known[k] == 0.0 or status_of(m, kind, k) != ON_MAP):
         return
@@ -108,8 +122,31 @@ def cast_vote(m: Memory, w: Work, kind: int, k: int, rotation: Array, translatio
         vote[12 + i] = m.x[i]
     m.used[slot] = decision & POSITION_ONLY  # rotation alone does not hold the position
     vote[VOTE_DISTANCE] = distance
+    _write_variances(m, kind, k, translation, covariance, distance, vote)
     m.vote_stamps[slot] = m.counters[NOW]
     m.counters[VOTE_HEAD] += 1
+
+
+@njit(cache=True)
+def _write_variances(
+    m: Memory, kind: int, k: int, translation: Array, covariance: Array, distance: float, vote: Array
+) -> None:
+    """Write the variances of a vote's whole error, biases and all."""
+    whole = covariance[3, 3] + covariance[4, 4] + covariance[5, 5]
+    vote[VOTE_TURN] = (covariance[0, 0] + covariance[1, 1] + covariance[2, 2]) / 3.0
+    vote[VOTE_ACROSS] = vote[VOTE_ALONG] = whole / 3.0
+    if kind != OBJECT_POSE:
+        return
+    along = 0.0
+    for i in range(3):
+        for j in range(3):
+            along += translation[i] * covariance[3 + i, 3 + j] * translation[j] / (distance * distance)
+    vote[VOTE_ACROSS], vote[VOTE_ALONG] = 0.5 * (whole - along), along
+    spread = m.x[m.layout[SPREADS] + SPREAD_SIZE * k :]
+    for bias in range(m.layout[N_BIAS_KINDS]):
+        vote[VOTE_TURN] += (spread[0] * bias_sigma(m.bias_model, bias, 0)) ** 2
+        vote[VOTE_ACROSS] += (distance * spread[1] * bias_sigma(m.bias_model, bias, 3)) ** 2
+        vote[VOTE_ALONG] += (distance * spread[2] * bias_sigma(m.bias_model, bias, 5)) ** 2
 
 
 @njit(cache=True)
@@ -186,7 +223,7 @@ def _is_contested(m: Memory, w: Work, first: int) -> bool:
 def try_to_start(m: Memory, w: Work) -> None:
     """Start where enough votes agree with each other and no other pose has nearly as many."""
     first = _first_vote(m, m.start[START_WINDOW_S], 2 * int(m.start[MIN_VOTES]))
-    count, span, _ = _agreement(m, w, first, False)
+    count, span, objects = _agreement(m, w, first, False)
     total = m.counters[VOTE_HEAD] - first
     if count < max(m.start[MIN_VOTES], m.start[MIN_SHARE] * total):
         if objects_seen(m.votes, first, m.counters[VOTE_HEAD]) < m.start[MIN_OBJECTS] or m.start[MAX_TILT] >= math.pi:
@@ -194,7 +231,7 @@ def try_to_start(m: Memory, w: Work) -> None:
         count, span, objects = _agreement(m, w, first, True)
         if objects < m.start[MIN_OBJECTS] or count < max(m.start[MIN_VOTES], m.start[MIN_PLACES] * total):
             return
-    if span < m.start[START_MIN_SPAN_S] or _is_contested(m, w, first):
+    if (span < m.start[START_MIN_SPAN_S] and objects < m.start[MIN_OBJECTS]) or _is_contested(m, w, first):
         return
     adopt(m, w, 0)
     m.counters[MODE], m.counters[STARTED_AT], m.counters[LAST_UPDATE] = TRACKING, m.counters[NOW], m.counters[NOW]

@@ -9,7 +9,8 @@ from fusion.nav_state import Array
 from fusion.so3_kernels import apply, apply_transposed, exp_so3, log_so3, multiply, multiply_transposed_right
 
 # Pose of the imu as voted, as integrated; distance of the object, the object in imu axes seen from the imu, and in the
-# world; its symmetry: axis in the world, order (1 none, 0 continuous); its number, -1: a camera pose.
+# world; its symmetry: axis in the world, order (1 none, 0 continuous); its number, -1: a camera pose;
+# variances of the whole error: of attitude (rad^2), of place across and along the arm (m^2).
 (
     VOTE_ROTATION,
     VOTE_POSITION,
@@ -21,8 +22,11 @@ from fusion.so3_kernels import apply, apply_transposed, exp_so3, log_so3, multip
     VOTE_AXIS,
     VOTE_ORDER,
     VOTE_OBJECT,
+    VOTE_TURN,
+    VOTE_ACROSS,
+    VOTE_ALONG,
     VOTE_SIZE,
-) = (0, 9, 12, 21, 24, 25, 28, 31, 34, 35, 36)
+) = (0, 9, 12, 21, 24, 25, 28, 31, 34, 35, 36, 37, 38, 39)
 
 _STANDS = math.sin(math.radians(20.0))  # an axis nearer to the vertical says nothing of the heading
 _APART = 0.1  # m, objects that tell a heading

@@ -33,6 +33,8 @@ def random_state(layout: StateLayout, rng: np.random.Generator) -> np.ndarray:
         T_imu_cam=RigidTransform.from_exp_coords(rng.normal(size=6)),
         T_world_obj=RigidTransform.from_exp_coords(rng.normal(size=(layout.n_objects, 6))),
     )
+    if layout.bias_kinds:
+        x[layout.spread_start :] *= rng.uniform(0.5, 2.0, len(x) - layout.spread_start)
     return retract_state(x, 0.1 * rng.normal(size=layout.n_error), layout)
 
 
