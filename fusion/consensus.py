@@ -14,6 +14,8 @@ from __future__ import annotations
 
 import math
 
+import numpy as np
+
 from fusion.compiled import njit
 from fusion.nav_state import Array, Ints
 from fusion.so3_kernels import apply, multiply
@@ -213,7 +215,23 @@ def has_rival(
     found = _search(
         votes, stamps, first, head, now, up, origin, gravity, options, C2, d2, v2, least, True, False, inlier, scratch
     )
-    return found >= 0
+    if found >= 0:
+        return True
+    # What a velocity that is not known yet hides shows once it is fitted, as it was for the correction itself.
+    found = _search(
+        votes, stamps, first, head, now, up, origin, gravity, options, C2, d2, v2, 0.0, True, False, inlier, scratch
+    )
+    if found < 0:
+        return False
+    marks = np.zeros(len(stamps), dtype=np.int64)
+    _mark(votes, stamps, first, head, now, origin, gravity, options, found, C2, d2, v2, -1.0, WHOLE, marks, scratch)
+    for _ in range(3):
+        _refine(votes, stamps, first, head, now, up, origin, gravity, options, C2, d2, v2, WHOLE, marks, scratch)
+    if not _is_another(votes[found, VOTE_DISTANCE], C2, d2, 0.0, options, scratch):
+        return False
+    of_rival = _mark(votes, stamps, first, head, now, origin, gravity, options, -1, C2, d2, v2, 0.0, 0, marks, scratch)
+    own = _mark(votes, stamps, first, head, now, origin, gravity, options, -1, C, d, v, 0.0, 0, marks, scratch)
+    return of_rival * options[LEAD] > own
 
 
 @njit(cache=True)

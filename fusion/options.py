@@ -174,7 +174,7 @@ class Start:
     lead: float = 1.2
     """A pose is believed if it has so many times the support of any quite other one."""
     min_span_s: float = 0.4
-    """Time that they must span, s."""
+    """Time that they must span, s; none where min_objects are at their places and no time offset is estimated."""
     window_s: float = 1.0
     """Votes so young count, s."""
     longest_window_s: float = 8.0

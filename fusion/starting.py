@@ -39,6 +39,7 @@ from fusion.memory import (
 )
 from fusion.nav_state import (
     AT_BIASES,
+    AT_TIME_OFFSET,
     BIASES,
     EXTRINSIC_POSITION,
     EXTRINSIC_ROTATION,
@@ -231,7 +232,9 @@ def try_to_start(m: Memory, w: Work) -> None:
         count, span, objects = _agreement(m, w, first, True)
         if objects < m.start[MIN_OBJECTS] or count < max(m.start[MIN_VOTES], m.start[MIN_PLACES] * total):
             return
-    if (span < m.start[START_MIN_SPAN_S] and objects < m.start[MIN_OBJECTS]) or _is_contested(m, w, first):
+    # Objects at their places do without a span; but a velocity that is not known yet looks like a time offset.
+    at_once = objects >= m.start[MIN_OBJECTS] and m.layout[AT_TIME_OFFSET] < 0
+    if (span < m.start[START_MIN_SPAN_S] and not at_once) or _is_contested(m, w, first):
         return
     adopt(m, w, 0)
     m.counters[MODE], m.counters[STARTED_AT], m.counters[LAST_UPDATE] = TRACKING, m.counters[NOW], m.counters[NOW]

@@ -7,9 +7,11 @@ from dataclasses import fields, replace
 import numpy as np
 import pytest
 from filter_runs import LAYOUTS, run, simulated
+from scipy.linalg import sqrtm
 from scipy.spatial.transform import Rotation
 
 from fusion import filter_loop, memory
+from fusion.bias_spread import white_part
 from fusion.measurements import CAMERA_POSE, ODOMETRY_STEP, Measurements
 from fusion.online import Estimator, OnlineOptions
 from fusion.options import FuseOptions, Odometry
@@ -44,10 +46,18 @@ def feed(estimator: Estimator, problem: Problem, event: tuple[int, int, int]) ->
     if m.kinds[rows[0]] == CAMERA_POSE:
         estimator.feed_camera_pose(index - shift, m.translations[rows[0]], q[0], m.covariances[rows[0]])
         return
-    keys = np.array(problem.keys)[m.objects[rows]]
-    estimator.feed_object_poses(
-        index - shift, keys[:, 0], m.translations[rows], q, m.covariances[rows], instances=keys[:, 1]
-    )
+    keys, t = np.array(problem.keys)[m.objects[rows]], m.translations[rows]
+    R = stated_for(m.covariances[rows], t, estimator.options)
+    estimator.feed_object_poses(index - shift, keys[:, 0], t, q, R, instances=keys[:, 1])
+
+
+def stated_for(white: np.ndarray, t: np.ndarray, options: FuseOptions) -> np.ndarray:
+    """Return the covariances whose white part is this."""
+    of_unit, R = white_part(np.tile(np.eye(6), (len(t), 1, 1)), t, options.noise, options.bias), []
+    for squared, wanted in zip(of_unit, white):
+        root = np.linalg.inv(sqrtm(squared).real)
+        R.append(root @ wanted @ root)
+    return np.array(R)
 
 
 def assert_ends_like(estimator: Estimator, problem: Problem, options: FuseOptions, tolerance: float = 1e-9) -> None:

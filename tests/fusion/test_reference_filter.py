@@ -11,7 +11,7 @@ from filter_runs import LAYOUTS, assert_same, run, simulated
 from fusion import filter_loop, memory, reference_filter
 from fusion.fuse import run_filter
 from fusion.measurements import ODOMETRY_STEP
-from fusion.options import DetectionNoise, Estimate, FuseOptions, Gate
+from fusion.options import DetectionBias, DetectionNoise, Estimate, FuseOptions, Gate
 from fusion.prepare import pose_problem
 from poet_loc.io.log_folder import read_log
 
@@ -44,7 +44,8 @@ def test_compiled_is_plain_through_an_imu_gap_and_with_noise_that_adapts():
 
 
 def test_compiled_is_plain_while_the_time_offset_is_followed():
-    problem, options = simulated(layout=LAYOUTS["time offset"], noise="white", stamp_delay_s=0.02), FuseOptions()
+    options = FuseOptions(bias=DetectionBias(use=False))
+    problem = simulated(layout=LAYOUTS["time offset"], options=options, noise="white", stamp_delay_s=0.02)
     compiled, plain = (run(loop, problem, options) for loop in (filter_loop.run_log, reference_filter.run_log))
     assert_same(compiled, plain)
     assert compiled.memory.counters[memory.DELAY] == pytest.approx(-20e6, abs=5e6)
