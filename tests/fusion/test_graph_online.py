@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from filter_runs import simulated
 from scipy.spatial.transform import Rotation
+from test_online import stated_for
 
 from fusion.graph import run_graph
 from fusion.graph_online import GraphEstimator
@@ -35,7 +36,8 @@ class Feed:
         m = self.problem.measurements
         stamp = int(m.stamps_ns[j]) - time_shift_ns(self.problem.calibration)
         q = Rotation.from_matrix(m.rotations[j].reshape(3, 3)).as_quat()
-        columns = m.translations[j : j + 1], q[None], m.covariances[j : j + 1]
+        t = m.translations[j : j + 1]
+        columns = t, q[None], stated_for(m.covariances[j : j + 1], t, self.estimator.options)
         object_id, instance = self.problem.keys[m.objects[j]]
         self.estimator.feed_object_poses(stamp, [object_id], *columns, instances=[instance])
 

@@ -55,7 +55,7 @@ def stated_for(white: np.ndarray, t: np.ndarray, options: FuseOptions) -> np.nda
     """Return the covariances whose white part is this."""
     of_unit, R = white_part(np.tile(np.eye(6), (len(t), 1, 1)), t, options.noise, options.bias), []
     for squared, wanted in zip(of_unit, white):
-        root = np.linalg.inv(sqrtm(squared).real)
+        root = np.linalg.inv(sqrtm(squared).real) if np.isfinite(squared).all() else np.eye(6)
         R.append(root @ wanted @ root)
     return np.array(R)
 
