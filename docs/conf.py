@@ -17,7 +17,7 @@ from commands_reference import write_commands_page
 from options_reference import write_options_page
 
 project = "poet-loc"
-author = "the authors of poet-loc"
+author = copyright = "the authors of poet-loc"
 release = metadata.version("poet-loc")
 extensions = ["myst_parser", "sphinx.ext.autodoc"]
 source_suffix = {".md": "markdown"}

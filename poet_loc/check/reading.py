@@ -53,8 +53,8 @@ def read_what_there_is(path: Path) -> tuple[Log, list[Finding]]:
         except InputError as error:
             try:
                 record, problems = tolerantly(file)
-            except InputError as unreadable:
-                record, problems = None, [_unreadable(file, unreadable)]
+            except InputError:
+                record, problems = None, []
             found.extend(problems or [_unreadable(file, error)])
             return record
 

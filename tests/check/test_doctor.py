@@ -113,3 +113,14 @@ def test_the_command(good_log, tmp_path, capsys) -> None:
     assert main(["check", str(tmp_path / "fixed")]) == 0
     assert main(["check", str(tmp_path / "nowhere")]) == 1
     assert "does not exist" in capsys.readouterr().err
+
+
+def test_a_trajectory_in_nanoseconds_is_told_with_line_and_remedy(good_log, tmp_path) -> None:
+    write_log(tmp_path, good_log)
+    path = tmp_path / "T_world_imu.tum"
+    rows = [line.split() for line in path.read_text().splitlines() if not line.startswith("#")]
+    path.write_text("".join(" ".join([first.replace(".", ""), *rest]) + "\n" for first, *rest in rows))
+    (finding,) = diagnose(tmp_path).findings
+    assert (finding.check, finding.file, finding.evidence["line"]) == ("unreadable", "T_world_imu.tum", 1)
+    assert "is no time in seconds" in finding.what
+    assert "TUM wants seconds" in finding.fix
