@@ -246,21 +246,37 @@ def transport(P: Array, before: Array, x: Array, error: Array, layout: Ints, scr
     n = layout[N_ERROR]
     G, skewed = scratch[0:9], scratch[9:18]
     multiply_transposed_left(x, before, G)
-    n_objects = layout[N_OBJECTS] if layout[AT_OBJECTS] >= 0 else 0
-    for part in range(2 + n_objects):
-        if part < 2:
-            row, at = POSITION_ERROR + 3 * part, POSITION + 3 * part
-            dx, dy, dz = before[at] - x[at], before[at + 1] - x[at + 1], before[at + 2] - x[at + 2]
-        else:
-            row = layout[AT_OBJECTS] + 6 * (part - 2) + 3
-            dx, dy, dz = -error[row], -error[row + 1], -error[row + 2]
-        # skew(d) @ R-
-        for j in range(3):
-            skewed[j] = dy * before[6 + j] - dz * before[3 + j]
-            skewed[3 + j] = dz * before[j] - dx * before[6 + j]
-            skewed[6 + j] = dx * before[3 + j] - dy * before[j]
-        _add_rows_and_columns(P, n, row, skewed)
+    for part in range(parts_carried(layout)):
+        lever_of_part(layout, part, before, x, error, skewed)
+        _add_rows_and_columns(P, n, row_of_part(layout, part), skewed)
     _turn_rows_and_columns(P, n, G, scratch)
+
+
+@njit(cache=True)
+def parts_carried(layout: Ints) -> int:
+    """Return how many parts of the error a correction carries along: position, velocity, positions of the objects."""
+    return 2 + (layout[N_OBJECTS] if layout[AT_OBJECTS] >= 0 else 0)
+
+
+@njit(cache=True)
+def row_of_part(layout: Ints, part: int) -> int:
+    """Return the first error state of such a part."""
+    return POSITION_ERROR + 3 * part if part < 2 else layout[AT_OBJECTS] + 6 * (part - 2) + 3
+
+
+@njit(cache=True)
+def lever_of_part(layout: Ints, part: int, before: Array, x: Array, error: Array, out: Array) -> None:
+    """Write [p- - p+]x R- (9,) of such a part."""
+    if part < 2:
+        at = POSITION + 3 * part
+        dx, dy, dz = before[at] - x[at], before[at + 1] - x[at + 1], before[at + 2] - x[at + 2]
+    else:
+        row = row_of_part(layout, part)
+        dx, dy, dz = -error[row], -error[row + 1], -error[row + 2]
+    for j in range(3):
+        out[j] = dy * before[6 + j] - dz * before[3 + j]
+        out[3 + j] = dz * before[j] - dx * before[6 + j]
+        out[6 + j] = dx * before[3 + j] - dy * before[j]
 
 
 @njit(cache=True)

@@ -30,7 +30,7 @@ Array = NDArray[np.float64]
 Error = Callable[[gtsam.CustomFactor, gtsam.Values, "list[Array] | None"], Array]
 
 
-_NOWHERE = np.eye(4)
+_NOWHERE = np.eye(4, order="F")  # as gtsam gives matrices: another order would be compiled once more
 
 
 @dataclass(frozen=True)
@@ -163,7 +163,7 @@ def _camera_pose_prior(detection: Detection, keyframe: int, model: Model) -> gts
 
 def error_at(d: Detection, x: Array, layout: StateLayout) -> tuple[Array, Array]:
     """Return a measurement's error (predicted minus measured) and Jacobian at a keyframe's nominal array."""
-    T_world_obj = pose3(x, OBJECTS + OBJECT_SIZE * d.object).matrix() if d.kind == OBJECT_POSE else np.eye(4)
+    T_world_obj = pose3(x, OBJECTS + OBJECT_SIZE * d.object).matrix() if d.kind == OBJECT_POSE else _NOWHERE
     kinds = range(layout.bias_kinds if d.kind == OBJECT_POSE else 0)
     e, J = detection_error(
         d.kind,

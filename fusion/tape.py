@@ -21,6 +21,7 @@ import math
 import numpy as np
 
 from fusion.compiled import njit
+from fusion.eskf import lever_of_part, parts_carried
 from fusion.measurements import MAX_COLUMNS
 from fusion.memory import AT_TAPE, BIAS_TIME, NOW, TAPE_END, TAPE_SIZE, Memory, Work
 from fusion.nav_state import (
@@ -112,21 +113,12 @@ def note_correction(m: Memory, w: Work, first: int, size: int, count: int) -> No
     """Write down a correction with rows first..first+size, from what `eskf.correct` left."""
     tape, n, before = m.tape, m.layout[N_ERROR], w.scratch[32:47]
     at = m.counters[TAPE_END]
-    parts = 2 + (m.layout[N_OBJECTS] if m.layout[AT_OBJECTS] >= 0 else 0)
+    parts = parts_carried(m.layout)
     tape[at] = parts
     multiply_transposed_left(m.x, before, tape[at + 1 : at + 10])
     at += 10
     for part in range(parts):
-        if part < 2:
-            p = POSITION + 3 * part
-            dx, dy, dz = before[p] - m.x[p], before[p + 1] - m.x[p + 1], before[p + 2] - m.x[p + 2]
-        else:
-            row = m.layout[AT_OBJECTS] + 6 * (part - 2) + 3
-            dx, dy, dz = -w.error[row], -w.error[row + 1], -w.error[row + 2]
-        for j in range(3):
-            tape[at + j] = dy * before[6 + j] - dz * before[3 + j]
-            tape[at + 3 + j] = dz * before[j] - dx * before[6 + j]
-            tape[at + 6 + j] = dx * before[3 + j] - dy * before[j]
+        lever_of_part(m.layout, part, before, m.x, w.error, tape[at : at + 9])
         at += 9
     tape[at], tape[at + 1] = size, count
     at += 2

@@ -5,13 +5,12 @@ from __future__ import annotations
 import numpy as np
 
 from fusion.compiled import njit
-from fusion.eskf import inject, transport
+from fusion.eskf import inject, row_of_part, transport
 from fusion.nav_state import (
     ACCEL_BIAS_ERROR,
     AT_BIASES,
     AT_CLONE,
     AT_GRAVITY,
-    AT_OBJECTS,
     CORE,
     EXTRINSIC_ROTATION,
     GYRO_BIAS_ERROR,
@@ -173,7 +172,7 @@ def _back_over_correction(record: Array, layout: Ints, gradient: Array, informat
     n, parts = layout[N_ERROR], int(record[0])
     rows = np.empty(parts, dtype=np.int64)
     for part in range(parts):
-        rows[part] = POSITION_ERROR + 3 * part if part < 2 else layout[AT_OBJECTS] + 6 * (part - 2) + 3
+        rows[part] = row_of_part(layout, part)
     at = 10 + 9 * parts
     _fold(record[1:10], record[10:at].reshape((parts, 9)), rows, gradient, information)
     size, count = int(record[at]), int(record[at + 1])
@@ -189,7 +188,13 @@ def _back_over_correction(record: Array, layout: Ints, gradient: Array, informat
     for r in range(size):
         for c in range(count):
             gradient[int(columns[c])] += H[r, c] * M[0, r]
-    # information <- C^T information C + H^T H with C = I - Z^T H, as information - H^T U - U^T H
+    _back_over_conditioning(H, columns, Z, information, U, M)
+
+
+@njit(cache=True)
+def _back_over_conditioning(H: Array, columns: Array, Z: Array, information: Array, U: Array, M: Array) -> None:
+    """information <- C^T information C + H^T H with C = I - Z^T H, as information - H^T U - U^T H."""
+    size, count, n = len(H), len(columns), len(information)
     for r in range(size):
         for j in range(n):
             U[r, j] = 0.0
