@@ -12,6 +12,7 @@ import sys
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
@@ -82,15 +83,17 @@ def calibration_(asked: argparse.Namespace) -> None:
 
 def map_(asked: argparse.Namespace) -> None:
     """Unknown maps: the first object anchors the world, the others are found."""
-    columns = [Column("noise"), Column("objects"), Column("RMSE", "Trajectory", "mm"), Column("NEES/dof", "Trajectory")]
+    columns = [Column("estimator"), Column("noise"), Column("objects")]
+    columns += [Column("RMSE", "Trajectory", "mm"), Column("NEES/dof", "Trajectory")]
     columns += [Column("position", "Map at the end", "mm"), Column("rotation", "Map at the end", "deg")]
-    rows = [unknown_map(noise, objects, asked.runs) for noise in ("white", "network") for objects in (1, 2, 4, 8)]
+    kinds = [(noise, objects) for noise in ("white", "network") for objects in (1, 2, 4, 8)]
+    rows = [unknown_map(estimator, *kind, asked.runs) for kind in kinds for estimator in ("eskf", "graph")]
     note = f"{asked.runs} simulated logs of 60 s a row; RMSE of the map over its objects but the first."
     print_tables([Table("Unknown maps", tuple(columns), tuple(rows), notes=(note,))])
 
 
-def unknown_map(noise: str, objects: int, runs: int) -> tuple[str, ...]:
-    options = FuseOptions(estimate=Estimate(map="unknown"))
+def unknown_map(estimator: Literal["eskf", "graph"], noise: str, objects: int, runs: int) -> tuple[str, ...]:
+    options = FuseOptions(estimator, estimate=Estimate(map="unknown"))
     if noise == "white":
         options = replace(options, bias=replace(options.bias, use=False))
     squares, nees, places, turns = [], [], [], []
@@ -106,7 +109,7 @@ def unknown_map(noise: str, objects: int, runs: int) -> tuple[str, ...]:
     rms = [
         f"{factor * np.sqrt(np.mean(v)):.{d}f}" if v else "–" for v, factor, d in ((places, 1e3, 1), (turns, 57.3, 2))
     ]
-    return noise, str(objects), f"{1e3 * np.sqrt(np.mean(squares)):.1f}", f"{np.mean(nees):.2f}", *rms
+    return estimator, noise, str(objects), f"{1e3 * np.sqrt(np.mean(squares)):.1f}", f"{np.mean(nees):.2f}", *rms
 
 
 def map_pairs(result: FuseResult, log: Log) -> Iterator[tuple[RigidTransform, RigidTransform]]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import gtsam
 import numpy as np
@@ -14,7 +14,7 @@ from fusion import object_biases
 from fusion.columns import Columns
 from fusion.eskf import ACCEPTED
 from fusion.graph_factors import Detection, Model, bias_factor, common_variables, linear_factor, measurement_factor
-from fusion.graph_linear import KERNELS, linearise
+from fusion.graph_linear import linearise
 from fusion.graph_model import bias_step
 from fusion.graph_motion import MotionChain
 from fusion.graph_odometry import OdometryStep, odometry_factor
@@ -29,6 +29,7 @@ from fusion.graph_variables import (
     pose_key,
     static_variables,
 )
+from fusion.graph_walk import Forgotten
 from fusion.measurements import OBJECT_POSE, ODOMETRY_STEP
 from fusion.nav_state import OBJECT_SIZE, StateLayout
 from fusion.options import Graph
@@ -47,10 +48,6 @@ class BiasModel:
     def stationary(self, kind: int) -> Array:
         """Return the stationary 1-sigma (6,) of a kind of bias."""
         return np.array([object_biases.bias_sigma(self.values, kind, i) for i in range(6)])
-
-    def jumped(self, kind: int) -> Array:
-        """Return the 1-sigma (6,) of a bias that was forgotten: the varying one has jumped."""
-        return self.stationary(kind) * (float(self.values[object_biases.BIAS_JUMP]) if kind == 0 else 1.0)
 
     def constant(self, kind: int) -> bool:
         """Tell whether a kind of bias stays as it is for ever."""
@@ -152,7 +149,7 @@ class GraphBuilder:
         return [(chain.variable.key, chain.stamp_ns) for chain in chains]
 
     def start(self, stamp_ns: int, x: Array, P: Array, known: Array, start_from: Array | None = None) -> None:
-        """Begin a graph with the filter's state as prior; object biases begin at their stationary sigma.
+        """Begin a graph with the filter's state as prior, object biases among it where anything ties them to the rest.
 
         known (K,) tells which object poses the filter knows; the others come in when they are first seen. Initial
         values are those of x, or of start_from.
@@ -167,13 +164,31 @@ class GraphBuilder:
         self._add_keyframe(stamp_ns)
         for variable in self._statics.values():
             self._add(variable)
-        first = keyframe_variables(self.keyframe, self.chain.with_imu) + list(self._statics.values())
-        self.graph.add(joint_prior(first, x, P))
         self.chains = {}
         for k in range(layout.n_objects):
             for kind in range(layout.bias_kinds):
-                place = Variable(-1, errors_of(layout, "biases", k, kind), layout.nominal_bias(k, kind).start)
-                self.chains[k, kind] = BiasChain(kind, place, self.bias_model.stationary(kind), stamp_ns)
+                self.chains[k, kind] = self._first_bias(k, kind, P)
+        first = keyframe_variables(self.keyframe, self.chain.with_imu) + list(self._statics.values())
+        first += [chain.variable for chain in self.chains.values() if chain.begun]
+        self.graph.add(joint_prior(first, x, P))
+
+    def _first_bias(self, k: int, kind: int, P: Array) -> BiasChain:
+        """Return an object's bias at the first keyframe: a variable where P ties it to anything but itself."""
+        layout = self.layout
+        errors, at = errors_of(layout, "biases", k, kind), layout.nominal_bias(k, kind).start
+        rows = P[errors.start : errors.stop].copy()
+        sigma = np.sqrt(np.diag(rows[:, errors.start :]))
+        rows[:, errors.start : errors.stop] = 0.0
+        chain = BiasChain(kind, Variable(-1, errors, at), sigma, self.stamp_ns)
+        if rows.any():
+            chain.variable = self._new_bias(chain)
+        return chain
+
+    def _new_bias(self, chain: BiasChain) -> Variable:
+        variable = replace(chain.variable, key=object_bias_key(self._bias_count))
+        self._bias_count += 1
+        self._add(variable)
+        return variable
 
     def _add(self, variable: Variable) -> None:
         variable.insert(self.values, self.x)
@@ -210,10 +225,12 @@ class GraphBuilder:
         self.clone = self.keyframe
         self.origin[self._clone_variable().place] = self.origin[:OBJECT_SIZE]
 
-    def add_linearised(self, columns: Columns, rotations: Array, covariances: Array, which: range) -> None:
+    def add_linearised(
+        self, columns: Columns, rotations: Array, covariances: Array, weights: Array, which: range
+    ) -> None:
         """Add measurements that passed the gate to the newest keyframe, linearised where its variables start.
 
-        rotations and covariances are those that the filter used.
+        rotations and covariances are those that the filter used, weights those that the kernel gives.
         """
         every, model = slice(which.start, which.stop), self.model
         passed, kinds = columns.decisions[every] & ACCEPTED, columns.kinds[every]
@@ -227,6 +244,7 @@ class GraphBuilder:
             rotations,
             columns.translations,
             covariances,
+            weights,
             self.stamp_ns,
             self.chain.stamps_ns,
             self.chain.values,
@@ -234,8 +252,6 @@ class GraphBuilder:
             self.x,
             self.origin,
             model.integers,
-            KERNELS[model.options.kernel],
-            model.options.kernel_width,
         )
         moved = int(columns.stamps[which.start]) != self.stamp_ns
         common = common_variables(self.layout, self.keyframe, self.chain.with_imu, moved)
@@ -279,11 +295,11 @@ class GraphBuilder:
             anywhere = gtsam.noiseModel.Diagonal.Sigmas(_ANYWHERE)
             self.graph.addPriorPose3(variable.key, self.values.atPose3(variable.key), anywhere)
 
-    def forget(self, k: int, kind: int, half: int) -> None:
-        """Let an object's bias of rotation (half 0) or translation (1) be another from the newest keyframe on."""
-        chain, part = self.chains[k, kind], slice(3 * half, 3 * half + 3)
+    def forget(self, bias: Forgotten) -> None:
+        """Let half of an object's bias be another from the newest keyframe on."""
+        chain, part = self.chains[bias.object, bias.kind], slice(3 * bias.half, 3 * bias.half + 3)
         phi, sigma = self.step(chain)
-        phi[part], sigma[part] = 0.0, self.bias_model.jumped(kind)[part]
+        phi[part], sigma[part] = 0.0, bias.sigma
         if chain.begun:
             self._add_bias(chain, phi, np.maximum(sigma, 1e-6))
         else:
@@ -314,13 +330,12 @@ class GraphBuilder:
     def _add_bias(self, chain: BiasChain, phi: Array | None, sigma: Array) -> None:
         """Add a bias variable at the newest keyframe: with a prior, or a step from the one before."""
         before, at = chain.variable, chain.variable.at
-        variable = Variable(object_bias_key(self._bias_count), before.errors, at)
-        self._bias_count += 1
-        if phi is None:
-            self.graph.addPriorVector(variable.key, np.zeros(6), gtsam.noiseModel.Diagonal.Sigmas(sigma))
-        else:
+        if phi is not None:
             self.x[at : at + 6] *= phi
             gap = phi * self.origin[at : at + 6] - self.x[at : at + 6] if self.fixed else None
-            self.graph.add(bias_factor(before.key, variable.key, phi, sigma, gap))
-        chain.variable, chain.stamp_ns = variable, self.stamp_ns
-        self._add(variable)
+        chain.variable, chain.stamp_ns = self._new_bias(chain), self.stamp_ns
+        if phi is None:
+            noise = gtsam.noiseModel.Diagonal.Sigmas(sigma)
+            self.graph.addPriorVector(chain.variable.key, np.zeros(6), noise)
+        else:
+            self.graph.add(bias_factor(before.key, chain.variable.key, phi, sigma, gap))

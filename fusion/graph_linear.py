@@ -20,11 +20,8 @@ from fusion.graph_model import (
     rate_at,
 )
 from fusion.measurements import OBJECT_POSE
-from fusion.nav_state import ACCEL_BIAS, GYRO_BIAS, N_BIAS_KINDS, N_OBJECTS, VELOCITY, Array, Ints
+from fusion.nav_state import ACCEL_BIAS, BIASES, GYRO_BIAS, N_BIAS_KINDS, N_OBJECTS, VELOCITY, Array, Ints
 from fusion.so3_kernels import copy
-
-NO_KERNEL, HUBER, CAUCHY = range(3)
-KERNELS = {"none": NO_KERNEL, "huber": HUBER, "cauchy": CAUCHY}
 
 SHARED = 16  # columns that any measurement may have: pose, velocity, extrinsics, time offset; behind the private ones
 _NOTHING = 1e-10  # of a column's length: what rounding leaves of it
@@ -40,6 +37,7 @@ def linearise(
     rotations: Array,
     translations: Array,
     covariances: Array,
+    weights: Array,
     keyframe_ns: int,
     motion_stamps: Ints,
     motion_values: Array,
@@ -47,19 +45,22 @@ def linearise(
     now: Array,
     start: Array,
     layout: Ints,
-    kernel: int,
-    width: float,
 ) -> tuple[Array, Ints, Array, int]:
-    """Linearise measurements first..first+len(passed) at a nominal array `start`, whitened, weighted by the kernel.
+    """Linearise measurements first..first+len(passed) at a nominal array `start`, whitened and weighted.
 
-    passed: which rows of each the gate let through. The motion from the keyframe is integrated at the biases in the
-    nominal array `now`. Returns rows of each object (K, private, private + SHARED + 1) and how many, and those of all
-    together (SHARED, SHARED + 1) and how many. Columns: biases, object pose, what SHARED says, the right-hand side.
+    passed: which rows of each the gate let through; weights: of every measurement. The motion from the keyframe is
+    integrated at the biases in the nominal array `now`; the object biases there are where their part is linearised, as
+    they may have begun far from it, and the right-hand side is brought to `start`. Returns rows of each object
+    (K, private, private + SHARED + 1) and how many, and those of all together (SHARED, SHARED + 1) and how many.
+    Columns: biases, object pose, what SHARED says, the right-hand side.
     """
     biases, n_objects = now[GYRO_BIAS : ACCEL_BIAS + 3] if not odometry else np.zeros(6), layout[N_OBJECTS]
     private = 6 * layout[N_BIAS_KINDS] + 6
     rows, owners = np.zeros((6 * len(passed), private + SHARED + 1)), np.zeros(6 * len(passed), dtype=np.int64)
-    x, count = np.empty(len(start)), 0
+    x, here, count = np.empty(len(start)), np.copy(start), 0
+    for i in range(3 if odometry else 0):  # it knows no velocity
+        here[VELOCITY + i] = 0.0
+    copy(now[layout[BIASES] :], here[layout[BIASES] :])
     for n in range(len(passed)):
         i = first + n
         if passed[n] == 0:
@@ -67,14 +68,18 @@ def linearise(
         above, end = 0 if passed[n] & ROTATION_ONLY else 3, 6 if passed[n] & POSITION_ONLY else 3
         motion = motion_between(motion_stamps, motion_values, keyframe_ns, stamps[i], biases, odometry)
         rate = rate_at(motion_stamps, motion_values, stamps[i], biases[0:3])
-        copy(start, x)
-        if odometry:  # it knows no velocity
-            x[VELOCITY : VELOCITY + 3] = 0.0
+        copy(here, x)
+        size = end - above
         e, J = error_and_jacobian(
-            kinds[i], objects[i], above, end - above, rotations[i], translations[i], rate, motion, x, layout
+            kinds[i], objects[i], above, size, rotations[i], translations[i], rate, motion, x, layout
         )
-        _whiten(J, e, covariances[i], above, kernel, width)
-        for r in range(end - above):
+        for kind in range(layout[N_BIAS_KINDS] if kinds[i] == OBJECT_POSE else 0):
+            at = layout[BIASES] + 6 * (objects[i] + kind * n_objects)
+            for r in range(size):
+                for c in range(6):
+                    e[r] -= J[r, BIAS_COLUMNS + 6 * kind + c] * (now[at + c] - start[at + c])
+        _whiten(J, e, covariances[i], above, weights[i])
+        for r in range(size):
             _arrange(J[r], -e[r], rows[count], private)
             owners[count] = objects[i] if kinds[i] == OBJECT_POSE else -1
             count += 1
@@ -82,11 +87,10 @@ def linearise(
 
 
 @njit(cache=True)
-def _whiten(J: Array, e: Array, covariance: Array, first: int, kernel: int, width: float) -> None:
-    """Bring an error and its Jacobian to unit noise, and scale both by the root of the kernel's weight."""
+def _whiten(J: Array, e: Array, covariance: Array, first: int, weight: float) -> None:
+    """Bring an error and its Jacobian to unit noise, and scale both by the root of a weight."""
     size, L = len(e), np.zeros((6, 6))
     cholesky(covariance, first, size, L)
-    squared = 0.0
     for r in range(size):
         for s in range(r):
             e[r] -= L[r, s] * e[s]
@@ -95,12 +99,6 @@ def _whiten(J: Array, e: Array, covariance: Array, first: int, kernel: int, widt
         e[r] /= L[r, r]
         for c in range(J.shape[1]):
             J[r, c] /= L[r, r]
-        squared += e[r] * e[r]
-    weight = 1.0
-    if kernel == HUBER and squared > width * width:
-        weight = width / np.sqrt(squared)
-    elif kernel == CAUCHY:
-        weight = width * width / (width * width + squared)
     for r in range(size):
         e[r] *= np.sqrt(weight)
         for c in range(J.shape[1]):

@@ -48,7 +48,7 @@ class _Kept:
     floats: Array
     integers: Ints
     cursor: Ints
-    fresh: Ints
+    fresh: Array
     first: int
     smoother: FixedLagSmoother | None
 
@@ -82,7 +82,7 @@ class GraphEstimator(Estimator):
         poses = int(seconds * self.online.max_pose_rate_hz)
         samples = int(seconds * self.online.max_imu_rate_hz)
         self._room, self._walk.out = loop_columns(_room_for(self._problem, samples, poses))
-        self._rotations, self._covariances = np.zeros((poses, 9)), np.zeros((poses, 6, 6))
+        self._fitted = np.zeros((poses, 9)), np.zeros((poses, 6, 6)), np.zeros(poses)
         self._samples = self._poses = 0
         self._rate, self._force = np.zeros(3), np.zeros(3)
         self._chain = MotionChain.of(self._problem, self.options)
@@ -179,7 +179,7 @@ class GraphEstimator(Estimator):
         walk, room, n, m = self._walk, self._room, self._samples, self._poses
         filled: list[Any] = [column[: n if i < 2 else m] for i, column in enumerate(room)]
         walk.columns = Columns(*filled)
-        walk.rotations, walk.covariances = self._rotations[:m], self._covariances[:m]
+        walk.rotations, walk.covariances, walk.weights = (column[:m] for column in self._fitted)
         if not walk.begun:
             walk.begin()
             self._keep()
@@ -230,7 +230,7 @@ class GraphEstimator(Estimator):
         since = oldest.now if oldest.smoother is None else min(oldest.now, oldest.smoother.builder.stamp_ns)
         samples = max(0, int(np.searchsorted(room.imu_stamps[: self._samples], since)) - REACH)
         poses = int(oldest.cursor[NEXT]) if oldest.smoother is None else oldest.first
-        for i, column in enumerate((*room, self._rotations, self._covariances)):
+        for i, column in enumerate((*room, *self._fitted)):
             gone = samples if i < 2 else poses
             column[: len(column) - gone] = column[gone:].copy()
         self._samples, self._poses = self._samples - samples, self._poses - poses

@@ -211,9 +211,8 @@ def newest_root(tree: gtsam.ISAM2 | gtsam.GaussianBayesTree, keys: Sequence[int]
 
 def forget_biases(builder: GraphBuilder, keyframe: Keyframe) -> None:
     """Let the object biases jump that the filter has forgotten at a keyframe."""
-    for i, half in np.argwhere(keyframe.forgotten):
-        kind, k = divmod(int(i), builder.layout.n_objects)
-        builder.forget(k, kind, int(half))
+    for one in keyframe.forgotten:
+        builder.forget(one)
 
 
 def add_measurements(builder: GraphBuilder, walk: Walk, which: range) -> None:
@@ -224,7 +223,7 @@ def add_measurements(builder: GraphBuilder, walk: Walk, which: range) -> None:
     whole = c.stamps[which[0]] == builder.stamp_ns and not (layout.extrinsics or layout.time_offset)
     native = whole and CAMERA_POSE in c.kinds[which.start : which.stop]  # gtsam has a factor for it
     if builder.fixed and not native:
-        builder.add_linearised(c, walk.rotations, walk.covariances, which)
+        builder.add_linearised(c, walk.rotations, walk.covariances, walk.weights, which)
     else:
         builder.add_detections(detections(builder, walk, which))
 

@@ -2,20 +2,21 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from fusion import memory
 from fusion.columns import Columns, Rows, read_fitted
 from fusion.compiled import njit
+from fusion.eskf import ACCEPTED, POSITION_ONLY, ROTATION_ONLY, cholesky, whiten
 from fusion.filter_loop import emit, end_of_stamp, measure
 from fusion.filter_motion import advance, begin, find_rate
 from fusion.fuse import loop_columns
-from fusion.measurements import ODOMETRY_STEP
-from fusion.memory import MODE, NOW, REPLACED, RESTARTS, TRACKING, Memory, views, work_views
+from fusion.measurements import ODOMETRY_STEP, residual_and_jacobian
+from fusion.memory import MODE, NOW, REPLACED, RESTARTS, TRACKING, Memory, Work, views, work_views
 from fusion.nav_state import AT_BIASES, N_BIAS_KINDS, N_OBJECTS, Array, Ints
 from fusion.options import FuseOptions
 from fusion.prepare import Problem, fill_memory
@@ -25,6 +26,11 @@ from fusion.so3_kernels import copy
 IMU_ROW, NEXT, ROWS, KEYFRAME_NS, CURSOR_SIZE = range(5)
 
 END, KEYFRAME, STARTED = range(3)  # why filter_until_keyframe returned
+
+NO_KERNEL, HUBER, CAUCHY = range(3)
+KERNELS = {"none": NO_KERNEL, "huber": HUBER, "cauchy": CAUCHY}
+
+_ROUNDED_UP = 1.0 + 1e-6
 
 
 @njit(cache=True)
@@ -46,7 +52,10 @@ def filter_until_keyframe(
     log: Columns,
     fitted_rotations: Array,
     fitted_covariances: Array,
-    fresh: Ints,
+    weights: Array,
+    kernel: int,
+    width: float,
+    fresh: Array,
     rows: Rows,
 ) -> int:
     """Filter up to the next keyframe and return KEYFRAME, STARTED where the filter (re)started or put an object
@@ -54,9 +63,9 @@ def filter_until_keyframe(
 
     A keyframe is due at the first stamp with measurements spacing_ns after the last one, where an object's bias jumped,
     wherever odometry is measured, and at an IMU sample idle_ns after the last one. Its own measurements are taken in.
-    fitted_rotations and fitted_covariances get each measurement as it was used (symmetry chosen, noise scaled); fresh
-    (kinds * objects * 2 halves) tells which biases nothing ties to the motion: those that are 1 and were 0 have just
-    been forgotten.
+    fitted_rotations and fitted_covariances get each measurement as it was used (symmetry chosen, noise scaled), weights
+    what a robust kernel gives it at the state that knows it; fresh (2, kinds * objects * 2 halves) tells of each bias
+    its variance where nothing ties it to the motion, else 0, and whether it has just been forgotten.
     """
     m = views(floats, integers)
     w = work_views(m.work, len(m.P))
@@ -77,6 +86,7 @@ def filter_until_keyframe(
                 read_fitted(m, w, log, i)
                 copy(w.measured, fitted_rotations[i])
                 copy(w.R.reshape(36), fitted_covariances[i].reshape(36))
+                weights[i] = _weight(m, w, log, i, kernel, width)
             jumped = _find_fresh(m, fresh)
             if not tracked or m.counters[RESTARTS] + m.counters[REPLACED] != restarts:
                 cursor[KEYFRAME_NS] = m.counters[NOW]
@@ -109,19 +119,55 @@ def rewrite_row(floats: Array, integers: Ints, cursor: Ints, rows: Rows) -> None
 
 
 @njit(cache=True)
-def _find_fresh(m: Memory, fresh: Ints) -> bool:
-    """Mark the bias halves (rotation, translation) that nothing ties to the motion: new, or just forgotten."""
+def _weight(m: Memory, w: Work, log: Columns, i: int, kernel: int, width: float) -> float:
+    """Return a kernel's weight of measurement i, which w holds as it was used, at the state of now.
+
+    That state knows the measurement: by its error before, one that knows little would refuse what it lacks most.
+    """
+    kind, passed = log.kinds[i], log.decisions[i] & ACCEPTED
+    if kernel == NO_KERNEL or passed == 0 or kind == ODOMETRY_STEP:
+        return 1.0
+    seen = (log.objects[i], w.measured[0:9], log.translations[i], m.x, w.rate, w.offset[0])
+    residual_and_jacobian(kind, *seen, m.layout, w.residual, w.H, m.columns, w.step)
+    first, end = 0 if passed & ROTATION_ONLY else 3, 6 if passed & POSITION_ONLY else 3
+    if not cholesky(w.R, first, end - first, w.L):
+        return 1.0
+    squared = whiten(w.L, w.residual, first, end - first, w.white)
+    if kernel == HUBER:
+        return 1.0 if squared <= width * width else width / math.sqrt(squared)
+    return width * width / (width * width + squared)
+
+
+@njit(cache=True)
+def _find_fresh(m: Memory, fresh: Array) -> bool:
+    """Find the bias halves (rotation, translation) that nothing ties to the motion, and those just forgotten.
+
+    These were tied, or are less sure than they were: what was refused ever since it was first seen jumps as well.
+    """
     found = False
     for half in range(2 * m.layout[N_BIAS_KINDS] * m.layout[N_OBJECTS]):
         at = m.layout[AT_BIASES] + 3 * half
-        tied = False
+        tied, variance = False, 0.0
         for r in range(3):
+            variance += m.P[at + r, at + r]
             for c in range(6):
                 tied = tied or m.P[at + r, c] != 0.0
-        if not tied and fresh[half] == 0:
-            found = True
-        fresh[half] = 0 if tied else 1
+        forgotten = not tied and (fresh[0, half] == 0.0 or variance > _ROUNDED_UP * fresh[0, half])
+        fresh[0, half], fresh[1, half] = 0.0 if tied else variance, 1.0 if forgotten else 0.0
+        found = found or forgotten
     return found
+
+
+@dataclass(frozen=True)
+class Forgotten:
+    """An object's bias that is another from a stamp on."""
+
+    object: int
+    kind: int
+    half: int
+    """0 rotation, 1 translation."""
+    sigma: Array
+    """(3,) of what it is now."""
 
 
 @dataclass(frozen=True)
@@ -131,8 +177,8 @@ class Keyframe:
     stamp_ns: int
     started: bool
     """The filter has just started, or started again: what was before does not count."""
-    forgotten: NDArray[np.bool_]
-    """(kinds * objects, 2) whose bias of rotation, translation was forgotten at this stamp."""
+    forgotten: list[Forgotten]
+    """Which biases were at this stamp."""
     between: range
     """Measurements after the keyframe before, up to this one."""
     at: range
@@ -152,10 +198,11 @@ class Walk:
         self.memory = memory.views.py_func(self.floats, self.integers)
         self.columns, self.out = loop_columns(problem)
         count = len(problem.measurements)
-        self.rotations, self.covariances = np.zeros((count, 9)), np.zeros((count, 6, 6))
+        self.rotations, self.covariances, self.weights = np.zeros((count, 9)), np.zeros((count, 6, 6)), np.ones(count)
         self.cursor = np.zeros(CURSOR_SIZE, dtype=np.int64)
         self.begun, self.first = False, 0
-        self.fresh = np.zeros(2 * max(1, problem.layout.n_objects * problem.layout.bias_kinds), dtype=np.int64)
+        self.fresh = np.zeros((2, 2 * max(1, problem.layout.n_objects * problem.layout.bias_kinds)))
+        self._kernel = KERNELS[options.graph.kernel], options.graph.kernel_width
         self._spacing_ns = round(0.999e9 / options.graph.keyframe_rate_hz)
         self._idle_ns = round(options.graph.idle_s * 1e9)
 
@@ -180,7 +227,8 @@ class Walk:
 
         to_the_end: the last samples are the log's, so a keyframe is due there too.
         """
-        c, cursor, fresh, newest = self.columns, self.cursor, self.fresh.copy(), int(self.cursor[KEYFRAME_NS])
+        c, cursor, newest = self.columns, self.cursor, int(self.cursor[KEYFRAME_NS])
+        self.fresh[1] = 0.0
         if not self.begun:
             self.begin()
         event = filter_until_keyframe(
@@ -192,6 +240,8 @@ class Walk:
             c,
             self.rotations,
             self.covariances,
+            self.weights,
+            *self._kernel,
             self.fresh,
             self.out,
         )
@@ -202,8 +252,14 @@ class Walk:
             cursor[KEYFRAME_NS] = stamp
         first, self.first = self.first, last
         here = first + int(np.searchsorted(c.stamps[first:last], stamp))
-        forgotten = ((self.fresh > 0) & (fresh == 0)).reshape(-1, 2)
+        forgotten = [self._forgotten(int(half)) for half in np.flatnonzero(self.fresh[1])]
         return Keyframe(stamp, event == STARTED, forgotten, range(first, here), range(here, last))
+
+    def _forgotten(self, half: int) -> Forgotten:
+        layout = self.problem.layout
+        kind, k = divmod(half // 2, layout.n_objects)
+        variances = np.diag(self.memory.P)[layout.error_slice("biases", k, kind)]
+        return Forgotten(k, kind, half % 2, np.sqrt(variances[3 * (half % 2) : 3 * (half % 2) + 3]))
 
     def rewrite(self) -> None:
         """Write the newest row again after a correction of the memory."""

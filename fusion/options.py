@@ -299,8 +299,8 @@ class Graph:
     """Without measurements there is a keyframe after so long, s."""
     lag_s: float = 2.0
     """How far back the fixed-lag smoother still changes its mind, s."""
-    kernel: Literal["none", "huber", "cauchy"] = "cauchy"
-    """Robust kernel of the measurements that passed the gate."""
+    kernel: Literal["none", "huber", "cauchy"] = "huber"
+    """Robust kernel of the measurements that passed the gate: huber leaves good ones their whole weight."""
     kernel_width: float = 3.5
     """Where it begins to bend, in 1-sigma of all six rows."""
     gnc: bool = False

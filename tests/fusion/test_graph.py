@@ -9,9 +9,14 @@ import numpy as np
 import pytest
 from filter_runs import simulated
 
+from fusion.eskf import ACCEPTED
 from fusion.fuse import fuse, run_filter
 from fusion.graph import run_graph
-from fusion.graph_smoother import FixedLagSmoother, joint_covariance
+from fusion.graph_builder import GraphBuilder
+from fusion.graph_factors import error_at
+from fusion.graph_motion import MotionChain
+from fusion.graph_smoother import FixedLagSmoother, detection_of, joint_covariance
+from fusion.graph_walk import Walk
 from fusion.options import DetectionBias, Estimate, FuseOptions, Graph
 from fusion.simulate import Displacement, SimulationOptions, simulate_with_truth
 from poet_loc.core.consistency import pose_nees
@@ -73,6 +78,51 @@ def test_a_lag_of_one_keyframe_is_the_filter(measurements, bias):
     assert np.all(attitude[later] < 0.25 * np.linalg.norm(causal.sigmas[later, :3], axis=1))
     np.testing.assert_allclose(graph.sigmas[later, :6], causal.sigmas[later, :6], rtol=0.1)
     assert np.mean(graph.gate.position_accepted == causal.gate.position_accepted) > 0.98
+
+
+def test_a_bias_that_jumps_before_its_object_was_ever_used_jumps_in_the_graph_too():
+    """An object that is grossly wrong from its first sight on is refused until the filter takes it for biased."""
+    options = FuseOptions()
+    problem = simulated(options=options, symmetric_objects=0)
+    measured = problem.measurements
+    late = measured.stamps_ns > problem.imu.stamps_ns[0] + 2_000_000_000
+    problem = with_measurements(problem, (measured.objects != 2) | late)
+    measured = problem.measurements
+    measured.translations[measured.objects == 2] *= 1.18  # further along the ray than its biases reach
+    causal = run_filter(problem, options)
+    graph = run_graph(problem, replace(options, estimator="graph", graph=EVERY_STAMP))
+    used = np.isin(np.arange(len(causal.gate)), np.flatnonzero(causal.gate.object_ids == problem.keys[2][0]))
+    used &= causal.gate.position_accepted
+    assert used.sum() > 10
+    assert np.flatnonzero(used)[0] > np.flatnonzero(measured.objects == 2)[15]
+    later = causal.stamps_ns > causal.gate.stamps_ns[used][0]
+    position, attitude = distances(graph, causal)
+    assert np.all(position[later] < 0.25 * np.linalg.norm(causal.sigmas[later, 3:6], axis=1))
+    assert np.all(attitude[later] < 0.25 * np.linalg.norm(causal.sigmas[later, :3], axis=1))
+    np.testing.assert_allclose(graph.sigmas[later, :6], causal.sigmas[later, :6], rtol=0.1)
+
+
+@pytest.mark.parametrize("kernel", ["none", "huber", "cauchy"])
+def test_a_kernel_weighs_a_measurement_by_its_error_at_the_state_that_knows_it(kernel):
+    options = FuseOptions(estimator="graph", graph=Graph(kernel=kernel, kernel_width=0.8))
+    problem = simulated(options=options, symmetric_objects=0)
+    walk, chain = Walk(problem, options), MotionChain.of(problem, options)
+    builder = GraphBuilder(problem.layout, walk.memory.x, walk.memory.bias_model, chain, options.graph)
+    kernels = {"huber": gtsam.noiseModel.mEstimator.Huber, "cauchy": gtsam.noiseModel.mEstimator.Cauchy}
+    bent = 0
+    for keyframe in walk.keyframes():
+        x = walk.memory.x
+        for i in keyframe.at:
+            passed = int(walk.columns.decisions[i]) & ACCEPTED
+            if keyframe.started or not passed:
+                continue
+            d = detection_of(builder, walk, i, keyframe.stamp_ns, x, passed)
+            rows, (e, _) = slice(d.first, d.first + d.size), error_at(d, x, problem.layout)
+            far = np.sqrt(e @ np.linalg.solve(d.covariance[rows, rows], e))
+            weight = 1.0 if kernel == "none" else kernels[kernel].Create(0.8).weight(far)
+            assert walk.weights[i] == pytest.approx(weight, rel=1e-6)
+            bent += far > 0.8
+    assert bent > 10
 
 
 def test_the_window_stays_bounded_however_long_the_log(monkeypatch):

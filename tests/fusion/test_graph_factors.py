@@ -10,13 +10,16 @@ import pytest
 from filter_runs import LAYOUTS, simulated
 from scipy.spatial.transform import RigidTransform, Rotation
 
+from fusion.graph_builder import GraphBuilder
 from fusion.graph_factors import Detection, Model, bias_factor, error_at, measurement_factor, robust
 from fusion.graph_model import BIAS_COLUMNS, MOTION_SIZE, TURN, bias_step, seen_at
 from fusion.graph_motion import MotionChain
 from fusion.graph_rows import Between
+from fusion.graph_smoother import joint_covariance
 from fusion.graph_variables import (
     GRAVITY_KEY,
     Variable,
+    block_diagonal,
     imu_bias,
     joint_prior,
     keyframe_variables,
@@ -245,6 +248,31 @@ def test_the_joint_prior_is_the_filters_gaussian():
     moved = retract_state(x, e, layout)
     expected = 0.5 * e @ np.linalg.solve(P, e)
     assert factor.error(values_of(variables, moved)) == pytest.approx(expected, rel=0.02)
+
+
+def test_a_graph_that_starts_from_a_filter_on_its_way_knows_all_that_it_knows():
+    """Object biases that are tied to the rest come in with it; the others begin with what they have of their own."""
+    layout, rng = StateLayout(n_objects=2, objects=True, bias_kinds=1), np.random.default_rng(8)
+    problem = replace(simulated(), layout=layout)
+    x = random_state(rng, layout)
+    n, free = layout.n_error, layout.error_slice("biases", 1)
+    A = (np.eye(n) + 0.2 * rng.normal(size=(n, n))) * 10.0 ** rng.uniform(-3, 0, n)[:, None]
+    A[free], A[:, free] = 0.0, 0.0
+    A[free, free] = np.diag([0.1, 0.2, 0.3, 0.4, 0.5, 0.6])
+    P = A @ A.T
+    builder = GraphBuilder(layout, x, np.zeros(14), MotionChain.of(problem, FuseOptions()), QUIET, fixed=True)
+    builder.start(int(problem.imu.stamps_ns[3]), x, P, np.ones(2))
+    graph, values, _ = builder.take()
+    tree = graph.linearize(values).eliminateMultifrontal(gtsam.Ordering.OrderingType.COLAMD, gtsam.EliminateQR)
+    variables = builder.newest
+    J = block_diagonal([variable.to_filter(x) for variable in variables])
+    found = J @ joint_covariance(tree, [variable.key for variable in variables]) @ J.T
+    at = [i for variable in variables for i in variable.errors]
+    assert sorted(at) == list(range(free.start))
+    scale = np.sqrt(np.diag(P)[at])
+    np.testing.assert_allclose(found / np.outer(scale, scale), P[np.ix_(at, at)] / np.outer(scale, scale), atol=1e-4)
+    assert not builder.chains[1, 0].begun
+    np.testing.assert_allclose(builder.chains[1, 0].sigma, [0.1, 0.2, 0.3, 0.4, 0.5, 0.6])
 
 
 def test_robust_noise_bends_where_it_is_told():
