@@ -35,7 +35,7 @@ class EmbeddedPresetOptions:
     """Rendered validation images, of other scenes."""
     detector_steps: int = 700
     """Steps of the detector alone, before the pose network joins."""
-    joint_steps: int = 6800
+    joint_steps: int = 12000
     """Steps of detector and pose network together."""
     batch: int = 16
     """Images per step."""
