@@ -49,7 +49,10 @@ from fusion.votes import (
     MIN_OBJECTS,
     MIN_PLACES,
     LEAD,
-) = range(16)
+    IS_GIVEN,
+    GIVEN_POSE,
+) = range(18)
+GIVEN_POSE_SIZE = 12  # rotation, position
 
 
 @njit(cache=True)

@@ -114,7 +114,7 @@ def never_started(problem: Problem, options: FuseOptions) -> InputError:
         f"the filter never started: no {options.start.min_votes} poses within "
         f"{options.start.window_s} s agree with each other and with gravity",
         path=problem.path,
-        fix="check the map and the extrinsics, or relax --start",
+        fix="check the map and the extrinsics, relax --start, or give --start.pose",
     )
 
 

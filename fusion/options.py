@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
 from typing import Literal
 
 from fusion.option_ranges import refuse_impossible
+from poet_loc.core.input_error import InputError
 
 
 @dataclass(frozen=True)
@@ -161,8 +163,11 @@ class HealthOptions:
 
 @dataclass(frozen=True)
 class Start:
-    """When the filter starts and starts again: votes that agree."""
+    """When the filter starts and starts again: votes that agree, or the first detection where a pose is given."""
 
+    pose: tuple[float, float, float, float, float, float, float] | None = None
+    """Where the IMU (without one, the camera) is in the world at the first detection: x y z, m, and the quaternion
+    qx qy qz qw. The filter then starts there, standing still, with the spread of --prior. None: from votes."""
     min_votes: int = 8
     """Votes that must agree before anything is published."""
     min_share: float = 0.4
@@ -195,6 +200,14 @@ class Start:
     """less than this share of the detections was used"""
     lost_min_votes: int = 12
     """and more than so many refused ones agree with each other."""
+
+    def __post_init__(self) -> None:
+        if self.pose is None:
+            return
+        if not all(map(math.isfinite, self.pose)):
+            raise InputError(f"start.pose is {self.pose}", fix="give seven finite numbers: x y z qx qy qz qw")
+        if abs(math.hypot(*self.pose[3:]) - 1.0) > 1e-3:
+            raise InputError(f"start.pose ends with {self.pose[3:]}", fix="give a unit quaternion qx qy qz qw")
 
 
 @dataclass(frozen=True)

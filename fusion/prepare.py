@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from fusion import consensus, filter_update, imu, meeting, memory, object_biases, odometry, place_watch
 from fusion.bias_spread import spread_model, white_part
@@ -200,6 +202,8 @@ def fill_memory(problem: Problem, options: FuseOptions) -> tuple[Array, NDArray[
     m.noise[imu.MEASURED] = options.imu.measured and problem.motion in WITH_IMU
     m.limits[: filter_update.SETTLED + 1] = _limits(options)
     m.start[: consensus.LEAD + 1] = _start(options)
+    if options.start.pose is not None:
+        _start_at(options.start.pose, options, m)
     m.spread_model[:] = spread_model(options.noise)
     m.bias_model[:] = _bias_model(options.bias)
     m.moved[: place_watch.MIN_POSES + 1] = _moved(options)
@@ -309,6 +313,15 @@ def _start(options: FuseOptions) -> list[float]:
         consensus.LEAD: start.lead,
     }
     return [float(values[i]) for i in range(len(values))]
+
+
+def _start_at(pose: Sequence[float], options: FuseOptions, m: memory.Memory) -> None:
+    """Let the filter start at a pose (x, y, z, qx, qy, qz, qw) of its body in the world."""
+    if options.estimate.map == "unknown":
+        raise InputError("start.pose and an unknown map: its first object is what makes the world", fix="leave one out")
+    rotation = Rotation.from_quat(pose[3:]).as_matrix().ravel()
+    m.start[consensus.IS_GIVEN] = 1.0
+    m.start[consensus.GIVEN_POSE : consensus.GIVEN_POSE + consensus.GIVEN_POSE_SIZE] = np.r_[rotation, pose[:3]]
 
 
 def _moved(options: FuseOptions) -> list[float]:

@@ -6,6 +6,8 @@ import math
 
 from fusion.compiled import njit
 from fusion.consensus import (
+    GIVEN_POSE,
+    IS_GIVEN,
     LONGEST_WINDOW_S,
     LOST_MIN_VOTES,
     LOST_SHARE,
@@ -222,22 +224,42 @@ def _is_contested(m: Memory, w: Work, first: int) -> bool:
 
 @njit(cache=True)
 def try_to_start(m: Memory, w: Work) -> None:
-    """Start where enough votes agree with each other and no other pose has nearly as many."""
+    """Start at the pose that is given, or where enough votes agree and no other pose has nearly as many."""
+    if m.start[IS_GIVEN] > 0.0:
+        _agree_with_given_pose(m, w)
+    elif not _found_by_votes(m, w):
+        return
+    adopt(m, w, 0)
+    m.counters[MODE], m.counters[STARTED_AT], m.counters[LAST_UPDATE] = TRACKING, m.counters[NOW], m.counters[NOW]
+
+
+@njit(cache=True)
+def _agree_with_given_pose(m: Memory, w: Work) -> None:
+    """Write the correction that takes the state to the given pose, standing still, as `_agreement` does."""
+    at = GIVEN_POSE
+    multiply_transposed_right(m.start[at : at + 9], m.x[0:9], w.step[96:105])
+    for i in range(3):
+        w.step[105 + i], w.step[108 + i] = m.start[at + 9 + i], 0.0
+        w.step[111 + i], w.step[114 + i] = m.x[POSITION + i], m.x[VELOCITY + i]
+    m.inliers[:] = 0
+
+
+@njit(cache=True)
+def _found_by_votes(m: Memory, w: Work) -> bool:
+    """Tell whether enough votes agree and have no rival; leave their correction in w.step[96:117]."""
     first = _first_vote(m, m.start[START_WINDOW_S], 2 * int(m.start[MIN_VOTES]))
     count, span, objects = _agreement(m, w, first, False)
     total = m.counters[VOTE_HEAD] - first
     if count < max(m.start[MIN_VOTES], m.start[MIN_SHARE] * total):
         if objects_seen(m.votes, first, m.counters[VOTE_HEAD]) < m.start[MIN_OBJECTS] or m.start[MAX_TILT] >= math.pi:
-            return
+            return False
         count, span, objects = _agreement(m, w, first, True)
         if objects < m.start[MIN_OBJECTS] or count < max(m.start[MIN_VOTES], m.start[MIN_PLACES] * total):
-            return
+            return False
     # Objects at their places do without a span; but a velocity that is not known yet looks like a time offset.
     at_once = objects >= m.start[MIN_OBJECTS] and m.layout[AT_TIME_OFFSET] < 0
-    if (span < m.start[START_MIN_SPAN_S] and not at_once) or _is_contested(m, w, first):
-        return
-    adopt(m, w, 0)
-    m.counters[MODE], m.counters[STARTED_AT], m.counters[LAST_UPDATE] = TRACKING, m.counters[NOW], m.counters[NOW]
+    settled = span >= m.start[START_MIN_SPAN_S] or at_once
+    return settled and not _is_contested(m, w, first)
 
 
 @njit(cache=True)

@@ -136,12 +136,57 @@ def test_one_object_of_which_every_other_detection_is_flipped_starts_nothing():
         fuse(log, OPTIONS)
 
 
+def at_the_first_detection(log: Log, shift: float = 0.0) -> FuseOptions:
+    """Return options that start at the true pose of the first detection, moved along x by so many metres."""
+    first = int(log.object_poses[""].stamps_ns[0])
+    truth, _ = log.T_world_imu.interpolate(np.array([first]))
+    pose = (*truth.translation[0] + [shift, 0.0, 0.0], *truth.rotation.as_quat()[0])
+    return replace(OPTIONS, start=replace(OPTIONS.start, pose=pose), prior=replace(OPTIONS.prior, velocity=1.0))
+
+
+@pytest.mark.parametrize("estimator", ["eskf", "graph"])
+def test_a_given_pose_starts_the_filter_where_votes_are_ambiguous(estimator):
+    log = table([CAN])
+    with pytest.raises(InputError, match=r"never started.*start\.pose"):
+        fuse(log, OPTIONS)
+    options = replace(at_the_first_detection(log), estimator=estimator)
+    when, distance, angle = start_of(log, options)
+    first, began = int(log.object_poses[""].stamps_ns[0]), int(log.imu.stamps_ns[0])
+    assert when == pytest.approx((first - began) * 1e-9, abs=1e-9)
+    assert distance < 0.02
+    assert angle < 3.0
+
+
+def test_a_wrong_given_pose_is_left_for_what_the_detections_say():
+    log = table([None] * 3)
+    result = fuse(log, at_the_first_detection(log, shift=3.0))
+    estimate, _ = result.trajectory.interpolate(log.T_world_imu.stamps_ns[-50:])
+    off = np.linalg.norm(estimate.translation - log.T_world_imu.T_world_body.translation[-50:], axis=1)
+    assert result.restarts == 1
+    assert off.max() < 0.05
+
+
+@pytest.mark.parametrize("pose", [(0.0, 0.0, np.nan, 0.0, 0.0, 0.0, 1.0), (1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)])
+def test_a_given_pose_that_is_none_is_refused(pose):
+    with pytest.raises(InputError, match=r"start\.pose"):
+        replace(OPTIONS.start, pose=pose)
+
+
+def test_a_given_pose_and_an_unknown_map_exclude_each_other():
+    log = table([None] * 3)
+    options = at_the_first_detection(log)
+    with pytest.raises(InputError, match="first object is what makes the world"):
+        fuse(log, replace(options, estimate=replace(options.estimate, map="unknown")))
+
+
+@pytest.mark.parametrize("given", [False, True])
 @pytest.mark.parametrize("log", [table([CAN, CAN, BOX]), turned(table([None] * 4), 25.0)])
-def test_compiled_is_plain_and_shuffled_is_in_order(log):
-    problem = pose_problem(log, OPTIONS)
-    compiled, plain = (run(loop, problem, OPTIONS) for loop in (filter_loop.run_log, reference_filter.run_log))
+def test_compiled_is_plain_and_shuffled_is_in_order(log, given):
+    options = at_the_first_detection(log) if given else OPTIONS
+    problem = pose_problem(log, options)
+    compiled, plain = (run(loop, problem, options) for loop in (filter_loop.run_log, reference_filter.run_log))
     assert_same(compiled, plain, 1e-8)
-    estimator = estimator_for(problem, OPTIONS)
+    estimator = estimator_for(problem, options)
     for event in shuffled(problem, 0.3, np.random.default_rng(0)):
         feed(estimator, problem, event)
-    assert_ends_like(estimator, problem, OPTIONS)
+    assert_ends_like(estimator, problem, options)
