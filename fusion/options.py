@@ -207,7 +207,7 @@ class Start:
         if not all(map(math.isfinite, self.pose)):
             raise InputError(f"start.pose is {self.pose}", fix="give seven finite numbers: x y z qx qy qz qw")
         if abs(math.hypot(*self.pose[3:]) - 1.0) > 1e-3:
-            raise InputError(f"start.pose ends with {self.pose[3:]}", fix="give a unit quaternion qx qy qz qw")
+            raise InputError(f"start.pose has the rotation {self.pose[3:]}", fix="give a unit quaternion qx qy qz qw")
 
 
 @dataclass(frozen=True)
