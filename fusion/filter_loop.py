@@ -12,7 +12,7 @@ from fusion.columns import OUT_CORE, OUT_SIGMA, Columns, Rows
 from fusion.compiled import njit
 from fusion.eskf import ACCEPTED, REJECTED
 from fusion.filter_motion import advance, begin, find_rate
-from fusion.filter_update import LIMIT_BOTH, SETTLED, follow_jumps, forget_biases, put_object, take
+from fusion.filter_update import LIMIT_BOTH, follow_jumps, forget_biases, is_unsettled, put_object, take
 from fusion.measurements import OBJECT_POSE, ODOMETRY_STEP
 from fusion.meeting import PUT, START_AGAIN, UNKNOWN_MAP, choose_anchor, forget_rivals, suppose
 from fusion.memory import (
@@ -182,7 +182,7 @@ def _order(m: Memory, w: Work, log: Columns, first: int, last: int) -> None:
     A state that is sure of itself takes them as they come. One that is not lets those that fit it best speak first:
     its gate is wide, and a gross error that came first would shut the others out.
     """
-    unsettled = m.P[3, 3] + m.P[4, 4] + m.P[5, 5] > m.limits[SETTLED]
+    unsettled = is_unsettled(m)
     for j in range(first, last):
         if unsettled:
             take(m, w, log, j, False)

@@ -20,6 +20,8 @@ from fusion.tape import note_correction, note_forgetting, note_meeting
 # Places in the limits.
 LIMIT_BOTH, LIMIT_ROTATION, LIMIT_POSITION, PARTIAL, ADAPTATION, MAX_SCALE, JUMP_AFTER, SETTLED = range(8)
 
+GROSS = 10.0  # times the limit of the rotation's nis
+
 
 @njit(cache=True)
 def take(m: Memory, w: Work, log: Columns, j: int, correcting: bool) -> int:
@@ -32,6 +34,8 @@ def take(m: Memory, w: Work, log: Columns, j: int, correcting: bool) -> int:
     count = _predict(m, w, kind, k)
     innovation(m, w, count)
     decision, status = gate(w.S, w.residual, m.limits, m.limits[PARTIAL], w.L, w.white, nis), status_of(m, kind, k)
+    if decision == POSITION_ONLY and is_blunder(m, nis[1]):
+        decision = REJECTED
     if not correcting:
         return decision
     if kind == OBJECT_POSE and m.limits[ADAPTATION] > 0.0:
@@ -44,6 +48,21 @@ def take(m: Memory, w: Work, log: Columns, j: int, correcting: bool) -> int:
         if len(m.tape) > 0:
             note_correction(m, w, first, size, count)
     return decision if status == ON_MAP else decision | RELEASED
+
+
+@njit(cache=True)
+def is_unsettled(m: Memory) -> bool:
+    """Tell whether the state is unsure of its position."""
+    return m.P[3, 3] + m.P[4, 4] + m.P[5, 5] > m.limits[SETTLED]
+
+
+@njit(cache=True)
+def is_blunder(m: Memory, nis_rotation: float) -> bool:
+    """Tell whether a rotation is so far off that an unsure state, whose gate is wide, should not trust the position.
+
+    A flipped box also seems to stand aside.
+    """
+    return nis_rotation > GROSS * m.limits[LIMIT_ROTATION] and is_unsettled(m)
 
 
 @njit(cache=True)

@@ -83,7 +83,8 @@ class Gate:
     partial: Literal["none", "position", "both"] = "position"
     """Use the position of a detection whose rotation is refused; both: and the rotation of one whose position is."""
     settled: float = 0.02
-    """While the position is less sure than this 1-sigma per axis, m, what fits best at a stamp is taken in first."""
+    """While the position is less sure than this 1-sigma per axis, m, what fits best at a stamp is taken in first, and
+    the position of a grossly turned detection is refused: that of a flipped one is wrong too, and the gate is wide."""
     adaptation: float = 0.0
     """How fast an object's noise follows its innovations, per measurement; 0: not at all."""
     max_noise_scale: float = 100.0

@@ -159,7 +159,7 @@ class ReferenceFilter:
         if nis[0] <= limits[filter_update.LIMIT_BOTH]:
             return ACCEPTED
         if limits[filter_update.PARTIAL] >= 1 and nis[2] <= limits[filter_update.LIMIT_POSITION]:
-            return POSITION_ONLY
+            return REJECTED if filter_update.is_blunder(self.m, nis[1]) else POSITION_ONLY
         if limits[filter_update.PARTIAL] >= 2 and nis[1] <= limits[filter_update.LIMIT_ROTATION]:
             return ROTATION_ONLY
         return REJECTED

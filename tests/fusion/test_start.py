@@ -179,6 +179,20 @@ def test_a_given_pose_and_an_unknown_map_exclude_each_other():
         fuse(log, replace(options, estimate=replace(options.estimate, map="unknown")))
 
 
+def test_flips_soon_after_the_start_do_not_move_the_filter():
+    """A flipped box also seems to stand aside, and the gate of an unsure state is wide."""
+    log = table([None])
+    poses = log.object_poses[""]
+    shown = poses.T_cam_obj.as_matrix()
+    half = RigidTransform.from_rotation(Rotation.from_rotvec([0.0, 0.0, np.pi])).as_matrix()
+    shown[1:4] = shown[1:4] @ half
+    shown[1:4, :3, 3] += [0.06, 0.0, 0.0]
+    log = replace(log, object_poses={"": replace(poses, T_cam_obj=RigidTransform.from_matrix(shown))})
+    used = fuse(log, at_the_first_detection(log)).gate.position_accepted
+    assert not used[1:4].any()
+    assert used[4:12].all()
+
+
 @pytest.mark.parametrize("given", [False, True])
 @pytest.mark.parametrize("log", [table([CAN, CAN, BOX]), turned(table([None] * 4), 25.0)])
 def test_compiled_is_plain_and_shuffled_is_in_order(log, given):
