@@ -22,7 +22,7 @@ class DetectionNoise:
     """1-sigma of position in every direction beside that, m: what stays of the error near an object."""
     rotation_deg: float = 3.0
     """1-sigma of rotation per axis, deg."""
-    stated_scale: float = 1.2
+    stated_scale: float = 1.1
     """The 1-sigma that a detection states of itself is taken so many times larger. It is of the whole error: split into
     white noise and biases by the shares that these options and those of the biases give, object by object."""
     stated_over: int = 100
