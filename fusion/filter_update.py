@@ -10,6 +10,7 @@ from fusion.columns import Columns, read, read_fitted
 from fusion.compiled import njit
 from fusion.eskf import ACCEPTED, POSITION_ONLY, REJECTED, ROTATION_ONLY, correct, gate, innovation
 from fusion.measurements import OBJECT_POSE, object_in_world, residual_and_jacobian
+from fusion.meeting import UNKNOWN_MAP
 from fusion.memory import MODE, TRACKING, Memory, Work
 from fusion.nav_state import N_BIAS_KINDS, N_OBJECTS, OBJECT_SIZE, OBJECTS, TIME_OFFSET
 from fusion.new_states import adopt_object
@@ -60,9 +61,10 @@ def is_unsettled(m: Memory) -> bool:
 def is_blunder(m: Memory, nis_rotation: float) -> bool:
     """Tell whether a rotation is so far off that an unsure state, whose gate is wide, should not trust the position.
 
-    A flipped box also seems to stand aside.
+    A flipped box also seems to stand aside. Where the map is unknown, what the state stands on may be the flip.
     """
-    return nis_rotation > GROSS * m.limits[LIMIT_ROTATION] and is_unsettled(m)
+    known = m.meeting[UNKNOWN_MAP] == 0.0
+    return known and nis_rotation > GROSS * m.limits[LIMIT_ROTATION] and is_unsettled(m)
 
 
 @njit(cache=True)
