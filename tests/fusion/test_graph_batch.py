@@ -156,7 +156,8 @@ def test_rows_join_where_keyframes_stand_and_do_not_depend_on_their_rate():
 
 def test_the_batch_mends_wrong_decisions_of_the_filter(monkeypatch):
     """Good measurements that were refused come back, gross errors that were let in go."""
-    problem = simulated(noise="white", symmetric_objects=0, duration_s=8.0)
+    options = replace(BATCH, bias=DetectionBias(use=False))
+    problem = simulated(options=options, noise="white", symmetric_objects=0, duration_s=8.0)
     measured, rng = problem.measurements, np.random.default_rng(0)
     chosen = rng.choice(np.flatnonzero(measured.stamps_ns > measured.stamps_ns[0] + 2_000_000_000), 12, replace=False)
     gross, good = chosen[:4], chosen[4:]
@@ -170,11 +171,11 @@ def test_the_batch_mends_wrong_decisions_of_the_filter(monkeypatch):
         walk.columns.decisions[gross], walk.columns.decisions[good] = 3, 0
         return found
 
-    right = run_graph(problem, BATCH)
+    right = run_graph(problem, options)
     monkeypatch.setattr(graph_batch, "_stretches", misled)
-    believing = run_graph(problem, replace(BATCH, graph=Graph(rounds=1)))
+    believing = run_graph(problem, replace(options, graph=Graph(rounds=1)))
     assert np.all(believing.gate.position_accepted[gross])
-    asked = run_graph(problem, BATCH)
+    asked = run_graph(problem, options)
     assert not np.any(asked.gate.position_accepted[gross])
     assert np.count_nonzero(asked.gate.position_accepted[good]) >= 7
     assert np.max(distances(asked, right)[0]) < 0.5 * np.max(distances(believing, right)[0])

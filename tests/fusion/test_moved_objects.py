@@ -9,7 +9,7 @@ from filter_runs import assert_same, run
 from fusion import filter_loop, reference_filter
 from fusion.fuse import fuse
 from fusion.nav_state import OBJECT_SIZE, OBJECTS, pose_at
-from fusion.options import FuseOptions, Moved
+from fusion.options import DetectionBias, FuseOptions, Moved
 from fusion.place_watch import TIMES
 from fusion.prepare import pose_problem
 from fusion.simulate import Displacement, SimulationOptions, simulate, simulate_with_truth
@@ -69,7 +69,7 @@ def test_nobody_is_released_where_nothing_was_moved(seed):
 
 def test_a_moved_object_is_estimated_anew_where_it_stands():
     log, truth = moved_log(distance=0.2, turn_deg=40.0, noise="white")
-    options = FuseOptions(moved=Moved(then="re-estimate"))
+    options = FuseOptions(moved=Moved(then="re-estimate"), bias=DetectionBias(use=False))
     problem = pose_problem(log, options)
     found = run(filter_loop.run_log, problem, options)
     result = fuse(log, options)
