@@ -76,7 +76,9 @@ def problem_of(case: Case, seconds: float) -> tuple[Problem, FuseOptions]:
     simulation = SimulationOptions(
         duration_s=seconds, objects=max(case.objects, 1), symmetric_objects=0, noise="white", camera_poses=True
     )
-    problem = pose_problem(simulate(simulation), options)
+    log = simulate(simulation)
+    unstated = {name: replace(poses, covariances=None) for name, poses in log.object_poses.items()}
+    problem = pose_problem(replace(log, object_poses=unstated), options)
     if case.camera:
         problem = replace(problem, layout=StateLayout(n_objects=case.objects, objects=case.objects > 0))
         return problem, options
@@ -128,7 +130,7 @@ def calls_of(problem: Problem, late_ns: int) -> list[tuple[bool, tuple[Any, ...]
         j = i - len(imu)
         pose, R = (m.translations[j], q[j]), m.covariances[j]
         if m.kinds[j] == OBJECT_POSE:
-            pose, R = ([keys[m.objects[j]][0]], pose[0][None], pose[1][None]), R[None]  # type: ignore[assignment]
+            pose, R = ([keys[m.objects[j]][0]], pose[0][None], pose[1][None]), None  # type: ignore[assignment]
         calls.append((False, (int(m.stamps_ns[j]), *pose, R)))
     return calls
 

@@ -9,9 +9,9 @@ IMU sample, make one factor per measurement (a CustomFactor on our compiled erro
 bias, insert initial values, call ISAM2 (update in our order of elimination, marginalise), ask for the newest state and
 its joint covariance. **Solver** are ISAM2's calls alone as ours makes them, on factors that are ready. **Peer** is
 gtsam's IncrementalFixedLagSmoother (QR) fed with bare's factors, ready, asked for the newest pose only. Times are CPU
-times of this process per keyframe, medians over the rounds. Solver must end in our last pose, bare within a
-millimetre of it (factors that can be called again let an object's bias act where the object was first seen, ours where
-it is predicted), or the run ends with an error.
+times of this process per keyframe, medians over the rounds. Solver must end in our last pose, bare within five
+millimetres of it (factors that can be called again let an object's bias act where the object was first seen, and a
+kernel weigh at the linearisation; ours do both where the filter is), or the run ends with an error.
 
 --long: the online graph, fed for so many seconds: time per keyframe and memory early and late.
 """
@@ -43,7 +43,7 @@ from fusion.options import FuseOptions
 from fusion.prepare import pose_problem, time_shift_ns
 from fusion.simulate import SimulationOptions, simulate
 
-TOLERANCE_M, TOLERANCE_BARE_M = 1e-6, 1e-3
+TOLERANCE_M, TOLERANCE_BARE_M = 1e-6, 5e-3
 
 
 Make = Callable[[], Any]
