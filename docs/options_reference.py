@@ -37,7 +37,8 @@ STAGES = (
 HEAD = """# Options
 
 Made from the dataclasses when the documentation is built. An option `group.name` is written `--group.name` on the
-command line (`_` becomes `-`) and as the field of a dataclass in Python. An unknown option is an error.
+command line (`_` becomes `-`) and as the field of a dataclass in Python. An unknown option is an error,
+and so is one that nothing reads with the estimator, the measurements, the map and the motion that were chosen.
 """
 
 

@@ -40,9 +40,7 @@ def motion_source(
 
     stamps_ns are those of the measurements. Raises InputError where the source or its calibration is missing.
     """
-    kind = options.motion
-    if kind == "auto":
-        kind = _best_of(log)
+    kind = motion_of(log, options)
     if kind == "imu+odometry":
         _odometry_of(log)
         return replace(_imu(log, calibration, options), kind=kind)
@@ -57,7 +55,10 @@ def motion_source(
     return MotionSource("constant-velocity", _nothing_measured(stamps_ns, options), _smooth(options), body)
 
 
-def _best_of(log: Log) -> Kind:
+def motion_of(log: Log, options: FuseOptions) -> Kind:
+    """Return what the options ask to carry the state, or the best that the log has."""
+    if options.motion != "auto":
+        return options.motion
     odometry = log.T_odom_cam is not None and len(log.T_odom_cam) > 1
     if log.imu is not None:
         return "imu+odometry" if odometry else "imu"

@@ -6,15 +6,17 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from fusion.simulate import SimulationOptions, simulate
-from poet_loc.cli.estimates import StageOptions, estimate_log, refuse_one_estimator, steps
+from poet_loc.cli.estimates import FUSIONS, StageOptions, estimate_log, refuse_one_estimator, steps
 from poet_loc.cli.run import show
 from poet_loc.cli.run_folder import WRITING_STEPS, write_run
 from poet_loc.cli.terminal import progress
+from poet_loc.cli.unread import refuse_unread
 from poet_loc.io.log_folder import Log, write_log
 from poet_loc.io.whole_folder import whole_folder
 
 DEMO_VIDEO = 12
 """Number of the video that is shown: the first one beyond the twelve test videos."""
+_VIDEO_S = 15.0
 
 
 @dataclass(frozen=True)
@@ -26,8 +28,8 @@ class Arguments:
     """Folder that gets log/, which every other command reads, and run/."""
     simulated: bool = False
     """Instead of images and a network: a minute of a simulated table top, whose object poses are drawn at random."""
-    duration_s: float = 15.0
-    """Length of the video, s, at 30 images per second."""
+    duration_s: float | None = None
+    """Length of what is seen, s; none: 15 of video, at 30 images per second, or 60 simulated."""
     seed: int = 0
     """Another seed is another world."""
     pictures: bool = True
@@ -45,6 +47,7 @@ def execute(arguments: Arguments) -> None:
     place, run = arguments.out / "log", arguments.out / "run"
     with whole_folder(arguments.out, arguments.overwrite) as folder:
         log = replace(_simulated(folder, arguments) if arguments.simulated else _seen(folder, arguments), path=place)
+        refuse_unread(arguments.options.fusion, FUSIONS, [log], arguments.options.solver.mode)
     with whole_folder(run) as folder, progress(steps() + WRITING_STEPS) as report:
         estimates = estimate_log(log, None, arguments.options, report)
         write_run(folder, estimates, arguments, report, arguments.pictures, arguments.paper)
@@ -53,7 +56,9 @@ def execute(arguments: Arguments) -> None:
 
 
 def _simulated(folder: Path, arguments: Arguments) -> Log:
-    log = simulate(SimulationOptions(seed=arguments.seed))
+    options = SimulationOptions(seed=arguments.seed)
+    seconds = options.duration_s if arguments.duration_s is None else arguments.duration_s
+    log = simulate(replace(options, duration_s=seconds))
     (folder / "log").mkdir()
     write_log(folder / "log", log)
     return log
@@ -62,5 +67,6 @@ def _simulated(folder: Path, arguments: Arguments) -> Log:
 def _seen(folder: Path, arguments: Arguments) -> Log:
     from poet_loc.videos import VideoOptions, log_from_pixels
 
-    video = VideoOptions(folder, duration_s=(arguments.duration_s, arguments.duration_s), seed=arguments.seed)
+    seconds = _VIDEO_S if arguments.duration_s is None else arguments.duration_s
+    video = VideoOptions(folder, duration_s=(seconds, seconds), seed=arguments.seed)
     return log_from_pixels(video, DEMO_VIDEO, folder=folder / "log")

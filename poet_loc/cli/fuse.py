@@ -13,6 +13,7 @@ from poet_loc.cli.noise_file import with_noise_from
 from poet_loc.cli.run import show
 from poet_loc.cli.run_folder import WRITING_STEPS, write_run
 from poet_loc.cli.terminal import progress
+from poet_loc.cli.unread import refuse_unread
 from poet_loc.io.log_folder import read_log
 from poet_loc.io.whole_folder import whole_folder
 
@@ -46,9 +47,10 @@ def execute(arguments: Arguments) -> None:
     stages = StageOptions(solver=SolverOptions(mode=arguments.mode), fusion=options)
     with whole_folder(arguments.out, arguments.overwrite, inputs=[arguments.log]) as folder:
         log = read_log(arguments.log, arguments.detections)
+        fusions = (fusion_of(options),)
+        refuse_unread(arguments.options, fusions, [log], arguments.mode, arguments.noise_from, arguments.detections)
         solve = options.measurements == "camera" and log.camera_poses is None
         modes = (arguments.mode,) if solve else ()
-        fusions = (fusion_of(options),)
         with progress(steps(modes, fusions) + WRITING_STEPS) as report:
             estimates = estimate_log(log, arguments.detections, stages, report, modes, fusions, strict=True)
             write_run(folder, estimates, arguments, report, arguments.pictures, arguments.paper)

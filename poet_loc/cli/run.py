@@ -11,6 +11,7 @@ from poet_loc.cli.estimates import FUSIONS, Estimates, Fusion, StageOptions, est
 from poet_loc.cli.noise_file import with_noise_from
 from poet_loc.cli.run_folder import WRITING_STEPS, named_files, write_run
 from poet_loc.cli.terminal import print_tables, progress
+from poet_loc.cli.unread import refuse_unread
 from poet_loc.io.log_folder import read_log
 from poet_loc.io.whole_folder import whole_folder
 from poet_loc.report.error_tables import Block, consistency_table, error_table
@@ -46,6 +47,14 @@ def execute(arguments: Arguments) -> None:
     refuse_one_estimator(fusion)
     with whole_folder(arguments.out, arguments.overwrite, inputs=[arguments.log]) as folder:
         log = read_log(arguments.log, arguments.detections)
+        refuse_unread(
+            arguments.options.fusion,
+            arguments.fusions,
+            [log],
+            arguments.options.solver.mode,
+            arguments.noise_from,
+            arguments.detections,
+        )
         stages = replace(arguments.options, fusion=fusion)
         with progress(steps(MODES, arguments.fusions) + WRITING_STEPS) as report:
             estimates = estimate_log(log, arguments.detections, stages, report, MODES, arguments.fusions)

@@ -15,6 +15,7 @@ from landmarks.options import Mode
 from poet_loc.cli.arguments import Flat
 from poet_loc.cli.estimates import FUSIONS, Fusion, StageOptions, estimate_log, refuse_one_estimator
 from poet_loc.cli.terminal import Silent, print_tables
+from poet_loc.cli.unread import refuse_unread
 from poet_loc.core.input_error import InputError, processes
 from poet_loc.io.log_folder import write_log
 from poet_loc.io.whole_folder import whole_folder
@@ -52,12 +53,25 @@ def execute(arguments: Arguments) -> None:
     processes("workers", arguments.workers)
     if arguments.out is None and arguments.runs < 1:
         raise InputError("nothing to do", fix="give --out LOG, --runs N, or both")
+    _refuse_unread(arguments)
     if arguments.out is not None:
         with whole_folder(arguments.out, arguments.overwrite) as folder:
             write_log(folder, simulate(arguments.simulation))
         print(arguments.out)
     if arguments.runs > 0:
         print_tables([runs_table(_summaries(arguments))])
+
+
+def _refuse_unread(arguments: Arguments) -> None:
+    """Raise InputError for options that the log, or the runs, do not read."""
+    if arguments.runs > 0:
+        options, log = arguments.options, simulate(arguments.simulation)
+        refuse_unread(options.fusion, arguments.fusions, [log], options.solver.mode)
+        return
+    usual = Arguments()
+    for name in ("modes", "fusions", "workers", "cluster", "options"):
+        if getattr(arguments, name) != getattr(usual, name):
+            raise InputError(f"--{name} changes nothing without --runs", fix="give --runs N, or leave it out")
 
 
 def summary_of_run(seed: int, arguments: Arguments) -> Summary:

@@ -16,6 +16,7 @@ from poet_loc.cli.arguments import Flat
 from poet_loc.cli.estimates import FUSIONS, Fusion, StageOptions, estimate_log, refuse_one_estimator, steps
 from poet_loc.cli.sensitivity_table import sensitivity_rows, sensitivity_tables, sensitivity_text
 from poet_loc.cli.terminal import Report, print_tables, progress
+from poet_loc.cli.unread import refuse_unread
 from poet_loc.core.input_error import InputError
 from poet_loc.io.log_folder import Log, read_log
 from poet_loc.io.whole_folder import write_whole_file
@@ -62,6 +63,7 @@ def execute(arguments: Arguments) -> None:
     refuse_one_estimator(arguments.options.fusion)
     form = _form(arguments)
     logs = [read_log(path) for path in arguments.logs]
+    _refuse_unread(arguments, logs)
     if arguments.sensitivity:
         rows = sensitivity_rows(logs, detection_sets(logs, arguments.detections))
         tables, text = sensitivity_tables(rows), partial(sensitivity_text, rows)
@@ -75,6 +77,18 @@ def execute(arguments: Arguments) -> None:
     else:
         write_whole_file(arguments.out, [text(form)])
         print(arguments.out)
+
+
+def _refuse_unread(arguments: Arguments, logs: Sequence[Log]) -> None:
+    """Raise InputError for options of what this table does not show."""
+    if arguments.sensitivity and (arguments.with_fusion or arguments.modes != MODES):
+        raise InputError("--sensitivity changes the solver's options itself", fix="leave --with-fusion and --modes out")
+    if arguments.sensitivity and arguments.options != StageOptions():
+        raise InputError("--sensitivity takes no options of the stages", fix="leave them out")
+    if arguments.fusions != FUSIONS and not arguments.with_fusion:
+        raise InputError("--fusions changes nothing without --with-fusion", fix="add it")
+    fusions = arguments.fusions if arguments.with_fusion else ()
+    refuse_unread(arguments.options.fusion, fusions, logs, arguments.options.solver.mode)
 
 
 def _form(arguments: Arguments) -> Format:

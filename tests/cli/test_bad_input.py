@@ -184,3 +184,36 @@ def test_several_sets_of_detections_need_a_name(log, tmp_path, capsys):
     (log / OBJECTS).rename(log / "object_poses_b.csv")
     assert main(["run", str(log), "--out", str(tmp_path / "run")]) == 1
     assert "a, b" in one_line(capsys)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        ("fuse LOG --out RUN --graph.gnc", ["graph.gnc", "the estimator", "graph"]),
+        ("fuse LOG --out RUN --estimator graph --graph.gnc", ["graph.gnc", "the estimator batch"]),
+        ("fuse LOG --out RUN --estimator batch --graph.lag-s 1", ["graph.lag-s", "the estimator graph"]),
+        ("fuse LOG --out RUN --estimator graph --moved.then re-estimate", ["moved.then", "the estimator eskf"]),
+        ("fuse LOG --out RUN --odometry.step-s 1", ["odometry.step-s", "odometry"]),
+        ("fuse LOG --out RUN --measurements camera --noise.across 0.1", ["noise.across", "measurements objects"]),
+        ("fuse LOG --out RUN --measurements camera --noise-from n.yaml", ["--noise-from", "no object poses"]),
+        ("fuse LOG --out RUN --camera-noise.solver-scale 3", ["camera-noise.solver-scale", "measurements camera"]),
+        ("fuse LOG --out RUN --prior.map-position 1", ["prior.map-position", "approximate"]),
+        ("fuse LOG --out RUN --mode prev", ["mode prev", "no camera poses"]),
+        ("run LOG --out RUN --fusions graph/objects --fusion.moved.then re-estimate", ["moved.then", "eskf"]),
+        ("run LOG --out RUN --fusion.graph.rounds 1", ["graph.rounds", "the estimator batch"]),
+        ("run LOG --out RUN --fusions eskf/objects --solver.mode out", ["mode out", "no camera poses"]),
+        ("table LOG --fusion.gate.probability 0.9", ["gate.probability", "nothing is fused"]),
+        ("table LOG --fusions batch/objects", ["--fusions", "--with-fusion"]),
+        ("table LOG --sensitivity --solver.distance 0.2", ["--sensitivity", "options"]),
+        ("demo --simulated --duration-s 3 --out RUN --options.fusion.graph.gnc", ["graph.gnc", "batch"]),
+        ("simulate --out RUN --fusions eskf/camera", ["--fusions", "--runs"]),
+        ("simulate --runs 1 --options.fusion.graph.gnc", ["graph.gnc", "batch"]),
+    ],
+)
+def test_an_option_that_changes_nothing_is_one_line(arguments, said, log, tmp_path, capsys, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "n.yaml").write_text("noise: {}\n")
+    assert main([word.replace("LOG", log.name).replace("RUN", "out") for word in arguments.split()]) == 1
+    line = one_line(capsys)
+    assert all(part in line for part in said), line
+    assert sorted(path.name for path in tmp_path.iterdir()) == [log.name, "n.yaml"]

@@ -6,7 +6,6 @@ import json
 import shutil
 import subprocess
 import sys
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -320,11 +319,8 @@ def test_demo_shows_what_the_network_sees(tmp_path, capsys):
     assert "--overwrite" in one_line(capsys)
 
 
-def test_the_simulated_demo_writes_a_log_and_a_run(tmp_path, monkeypatch, capsys):
-    from poet_loc.cli import demo
-
-    monkeypatch.setattr(demo, "simulate", lambda options: simulate(replace(options, duration_s=6.0)))
-    assert main(["demo", "--simulated", "--out", str(tmp_path / "demo"), "--seed", "2"]) == 0
+def test_the_simulated_demo_writes_a_log_and_a_run(tmp_path, capsys):
+    assert main(["demo", "--simulated", "--out", str(tmp_path / "demo"), "--seed", "2", "--duration-s", "6"]) == 0
     shown = capsys.readouterr().out
     assert files(tmp_path / "demo" / "run") == FILES
     assert str(tmp_path / "demo" / "run" / "recording.rrd") in shown

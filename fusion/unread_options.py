@@ -1,0 +1,119 @@
+"""Options that nothing reads: where a choice of estimator, measurements or motion leaves one without effect."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, fields, is_dataclass
+from fnmatch import fnmatch
+from typing import Any
+
+from fusion.motion_source import Kind
+from fusion.options import FuseOptions
+from fusion.prepare import WITH_IMU, re_estimates
+from poet_loc.core.input_error import InputError
+
+
+@dataclass(frozen=True)
+class Reader:
+    """One estimate that is to be made with the options."""
+
+    options: FuseOptions
+    motion: Kind
+    """What moves its state."""
+    solved: bool = True
+    """Where it fuses camera poses: these are the solver's, not the log's own."""
+    stated: bool = True
+    """Where it fuses objects: some detections bring a covariance."""
+
+
+@dataclass(frozen=True)
+class Rule:
+    """Options by their dotted names, with * for any, and who reads them."""
+
+    names: str
+    by: str
+    read: Callable[[Reader], bool]
+
+    def covers(self, name: str) -> bool:
+        """Tell whether the rule is about an option."""
+        return any(fnmatch(name, each) for each in self.names.split())
+
+
+def refuse_unread(options: FuseOptions, readers: Sequence[Reader]) -> None:
+    """Raise InputError for an option that is not at its default although none of the estimates reads it."""
+    for name in changed(options, FuseOptions()):
+        rules = [rule for rule in RULES if rule.covers(name)]
+        unmet = [[rule for rule in rules if not rule.read(reader)] for reader in readers]
+        if not all(unmet):
+            continue
+        typed = name.replace("_", "-")
+        if not readers:
+            raise InputError(f"{typed} changes nothing: nothing is fused", fix="leave it out")
+        by = min(unmet, key=len)[0].by
+        raise InputError(f"{typed} changes nothing here", fix=f"it goes with {by}: choose that, or leave it out")
+
+
+def changed(options: object, default: object) -> Iterator[str]:
+    """Yield the dotted names of what is not at its default in a record of options and in the records inside it."""
+    for each in fields(options):  # type: ignore[arg-type]
+        value, usual = getattr(options, each.name), getattr(default, each.name)
+        if is_dataclass(value):
+            yield from (f"{each.name}.{name}" for name in changed(value, usual))
+        elif value != usual:
+            yield each.name
+
+
+def _estimator(*names: str) -> Callable[[Reader], bool]:
+    return lambda reader: reader.options.estimator in names
+
+
+def _motion(*kinds: Kind) -> Callable[[Reader], bool]:
+    return lambda reader: reader.motion in kinds
+
+
+def _measurements(name: str) -> Callable[[Reader], bool]:
+    return lambda reader: reader.options.measurements == name
+
+
+def _asked(ask: Callable[[FuseOptions], Any]) -> Callable[[Reader], bool]:
+    return lambda reader: bool(ask(reader.options))
+
+
+_OF_OBJECTS = (
+    "noise.* bias.* moved.* meeting.* estimate.map prior.map_* "
+    "gate.adaptation gate.max_noise_scale start.min_objects start.min_places"
+)
+
+RULES = (
+    Rule("graph.*", "the estimators graph and batch", _estimator("graph", "batch")),
+    Rule("graph.gnc graph.max_iterations graph.rounds", "the estimator batch", _estimator("batch")),
+    Rule("graph.lag_s graph.relinearize*", "the estimator graph", _estimator("graph")),
+    Rule("graph.relinearize", "a graph with relinearize-every", _asked(lambda o: o.graph.relinearize_every > 0)),
+    Rule("graph.kernel_width", "a kernel, or gnc", _asked(lambda o: o.graph.kernel != "none" or o.graph.gnc)),
+    Rule("moved.then", "the estimator eskf", _estimator("eskf")),
+    Rule("moved.[!r]*", "moved.release", _asked(lambda o: o.moved.release)),
+    Rule(_OF_OBJECTS, "--measurements objects", _measurements("objects")),
+    Rule("camera_noise.*", "--measurements camera", _measurements("camera")),
+    Rule("camera_noise.solver_scale", "camera poses of the solver", lambda reader: reader.solved),
+    Rule("camera_noise.[!s]*", "camera poses of the log's own", lambda reader: not reader.solved),
+    Rule("noise.stated_*", "detections with covariances", lambda reader: reader.stated),
+    Rule("bias.[!u]* noise.stated_over", "bias.use", _asked(lambda o: o.bias.use)),
+    Rule("gate.max_noise_scale", "a gate with adaptation", _asked(lambda o: o.gate.adaptation > 0.0)),
+    Rule("meeting.*", "an unknown estimate.map", _asked(lambda o: o.estimate.map == "unknown" or re_estimates(o))),
+    Rule("meeting.replace", "an unknown estimate.map", _asked(lambda o: o.estimate.map == "unknown")),
+    Rule("prior.map_*", "an approximate estimate.map", _asked(lambda o: o.estimate.map == "approximate")),
+    Rule("prior.extrinsic_*", "estimate.extrinsics", _asked(lambda o: o.estimate.extrinsics)),
+    Rule("prior.time_offset", "estimate.time-offset", _asked(lambda o: o.estimate.time_offset)),
+    Rule("prior.gravity_deg", "estimate.gravity", _asked(lambda o: o.estimate.gravity)),
+    Rule("imu.* gap.* prior.*_bias start.max_tilt_deg start.min_places", "an IMU", _motion(*WITH_IMU)),
+    Rule("prior.velocity", "another motion than odometry", _motion(*WITH_IMU, "constant-velocity")),
+    Rule("odometry.*", "odometry", _motion("odometry", "imu+odometry")),
+    Rule("odometry.step_s", "odometry beside an IMU", _motion("imu+odometry")),
+    Rule("constant_velocity.*", "the motion constant-velocity", _motion("constant-velocity")),
+    Rule(
+        "start.min_votes start.min_share start.min_objects start.min_places start.min_span_s",
+        "a start without start.pose",
+        _asked(lambda o: o.start.pose is None),
+    ),
+)
+"""Who reads what; an option that no rule names is read by all. An estimate reads what all its rules let it read."""
