@@ -216,11 +216,12 @@ class Estimator:
         )
         usable = (landmarks >= 0) & ~(t[:, 2] <= NEAREST_OBJECT)
         self._not_in_map += int(len(ids) - np.count_nonzero(usable))
-        R = self._detection_covariances(t, covariances)
         q = np.asarray(q_xyzw, dtype=float).reshape(len(ids), 4)
+        stated = None if covariances is None else np.asarray(covariances, dtype=float).reshape(len(ids), 6, 6)
         if not usable.all():
-            landmarks, q, t, R = landmarks[usable], q[usable], t[usable], R[usable]
-        self._feed_poses(stamp_ns, OBJECT_POSE, landmarks, q, t, R)
+            landmarks, q, t = landmarks[usable], q[usable], t[usable]
+            stated = None if stated is None else stated[usable]
+        self._feed_poses(stamp_ns, OBJECT_POSE, landmarks, q, t, self._detection_covariances(t, stated))
 
     def feed_camera_pose(
         self, stamp_ns: SupportsIndex, position: ArrayLike, q_xyzw: ArrayLike, covariance: ArrayLike | None = None
@@ -311,12 +312,12 @@ class Estimator:
             found[-1, 0] = _object_health(rows[-1], False)
         return found
 
-    def _detection_covariances(self, t: Array, covariances: ArrayLike | None) -> Array:
+    def _detection_covariances(self, t: Array, covariances: Array | None) -> Array:
         noise, places = self.options.noise, np.where(np.isfinite(t), t, 1.0)
         sigma = math.radians(noise.rotation_deg)
         if covariances is None:
             return ray_aligned_covariance(places, noise.across, noise.along, sigma, noise.floor)
-        given = np.array(covariances, dtype=float).reshape(len(t), 6, 6)
+        given = covariances.copy()
         stated = np.isfinite(given).all(axis=(1, 2))
         given[stated] = white_part(given[stated], places[stated], noise, self.options.bias)
         if stated.all():

@@ -294,10 +294,21 @@ def test_odometry_is_fed_beside_the_imu(lateness_s):
     assert_ends_like(estimator, problem, options)
 
 
+@pytest.mark.parametrize("stated", [None, np.tile(0.01 * np.eye(6), (2, 1, 1))], ids=["unstated", "stated"])
+def test_a_detection_at_the_camera_is_left_out_before_its_ray_is_asked_for(stated):
+    problem, q = simulated(noise="white"), [[0.0, 0.0, 0.0, 1.0]] * 2
+    estimator = estimator_for(problem, FuseOptions())
+    ids = [object_id for object_id, _ in problem.keys[:2]]
+    with np.errstate(all="raise"):
+        estimator.feed_object_poses(10**9, ids, [[0.0, 0.0, 0.0], [0.0, 0.0, 1.0]], q, stated)
+    assert estimator.health().not_in_map == 1
+    assert estimator.health().waiting == 1
+
+
 def test_odometry_that_was_refused_is_made_up_for_by_the_next():
     options = FuseOptions(motion="imu+odometry", odometry=Odometry(step_s=0.1))
     log = simulate(SimulationOptions(duration_s=6.0, camera_rate_hz=10.0, objects=3, noise="white", odometry=True))
-    poses = pose_problem(log, FuseOptions())
+    poses = pose_problem(log, FuseOptions(motion="imu"))
     estimator = estimator_for(replace(poses, layout=replace(poses.layout, clone=True)), options)
     odometry = dict(zip(log.T_odom_cam.stamps_ns.tolist(), log.T_odom_cam.T_world_body))
     sent = 0
