@@ -21,7 +21,7 @@ from poet_loc.io.convert_rosbag import ConvertRosbagOptions, convert_rosbag
 from poet_loc.io.log_folder import Log, write_log
 from poet_loc.io.mcap_log import write_mcap
 
-rosbags = pytest.importorskip("rosbags")
+rosbags = pytest.importorskip("rosbags", reason="the extra bags is not installed")
 
 START = 1_700_000_000_123_456_789
 RECEIVED_LATER = 7_000_000  # ns
@@ -263,8 +263,7 @@ def test_our_mcap_goes_round(tmp_path) -> None:
 
 def test_rerun_opens_our_mcap(tmp_path) -> None:
     rerun = shutil.which("rerun", path=str(Path(sys.executable).parent))
-    if rerun is None:
-        pytest.skip("the program rerun is not installed")
+    assert rerun is not None  # it comes with rerun-sdk
     write_mcap(tmp_path / "out.mcap", whole_log())
     for arguments in (["check", "out.mcap"], ["convert", "out.mcap", "-o", "out.rrd"]):
         done = subprocess.run([rerun, "mcap", *arguments], cwd=tmp_path, capture_output=True, text=True, timeout=120)
@@ -276,7 +275,7 @@ def test_rerun_opens_our_mcap(tmp_path) -> None:
 
 
 def test_raw_and_compressed_images_are_written(tmp_path) -> None:
-    cv2 = pytest.importorskip("cv2")
+    import cv2
     from rosbags.rosbag2 import Writer
 
     messages, pixels = Messages("ros2_humble"), rng.integers(0, 255, (4, 5, 3), dtype=np.uint8)
