@@ -18,6 +18,8 @@ from poet_loc.io.whole_folder import write_whole_file
 
 Array = NDArray[np.float64]
 
+_STAMPS = "write stamps as whole nanoseconds: seconds times 1e9"
+
 
 @dataclass(frozen=True)
 class NumberTable:
@@ -82,7 +84,9 @@ def read_number_csv(
     column_name turns a header cell into a name of required or optional.
     """
     path, optional = Path(path), dict(optional or {})
-    names = [column_name(cell.strip()) for cell in first_line(path).split(",")]
+    header = first_line(path)
+    _refuse_other_separators(path, header)
+    names = [column_name(cell.strip()) for cell in header.split(",")]
     wanted = dict(required) | (optional if any(name in names for name in optional) else {})
     _check_header(path, names, wanted, optional, further_columns)
     picked = [name for name in names if name in wanted]
@@ -109,6 +113,12 @@ def write_csv(path: str | Path, header: Sequence[str], columns: Sequence[ArrayLi
 def _cells(column: ArrayLike) -> Iterable[str]:
     values = np.asarray(column)
     return map(repr if values.dtype.kind == "f" else str, values.tolist())
+
+
+def _refuse_other_separators(path: Path, header: str) -> None:
+    for character, name in ((";", "semicolons"), ("\t", "tabs")):
+        if "," not in header and character in header:
+            raise InputError(f"the columns are separated by {name}", path=path, line=1, fix="separate them by commas")
 
 
 def _check_header(
@@ -175,7 +185,8 @@ def _explain(
         for name, cell in zip(names, [cells[k] for k in usecols] if usecols else cells, strict=True):
             what = _wrong_cell(cell.strip(), dtype[name])
             if what:
-                raise InputError(f"column {name} {what}", path=path, line=line, fix="correct or leave out the row")
+                fix = _STAMPS if name.startswith("timestamp") and "." in cell else "correct or leave out the row"
+                raise InputError(f"column {name} {what}", path=path, line=line, fix=fix)
     raise InputError(f"cannot be read: {error}", path=path, fix="save it as plain text, one row a line") from error
 
 

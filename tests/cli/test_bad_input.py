@@ -52,6 +52,10 @@ def repeat_line(number: int) -> Callable[[Path], None]:
     return spoil
 
 
+def swap_separator(separator: str) -> Callable[[Path], None]:
+    return lambda path: path.write_text(path.read_text().replace(",", separator)) and None
+
+
 def later_by_an_hour(path: Path) -> None:
     header, *rows = path.read_text().splitlines()
     moved = [f"{int(row.partition(',')[0]) + 3600 * 10**9},{row.partition(',')[2]}" for row in rows]
@@ -113,6 +117,14 @@ SPOILT = {
     "two landmarks with one id": (MAP, change_landmarks(lambda marks: marks.append(marks[0])), ["landmarks.json"]),
     "a landmark without a place": (MAP, change_landmarks(lambda marks: marks[1].pop("t")), ["landmarks.json", "t"]),
     "a misspelt key in the map": (MAP, change_landmarks(lambda marks: marks[1].update(covar=None)), ["covar"]),
+    "stamps in seconds": (
+        OBJECTS,
+        cell(5, 0, "1700000000.100"),
+        ["object_poses.csv:5", "1700000000.100", "nanoseconds"],
+    ),
+    "imu stamps in seconds": (IMU, cell(5, 0, "1.7e9"), ["imu.csv:5", "1.7e9", "nanoseconds"]),
+    "semicolons": (OBJECTS, swap_separator(";"), ["object_poses.csv:1", "semicolons", "commas"]),
+    "tabs": (IMU, swap_separator("\t"), ["imu.csv:1", "tabs", "commas"]),
     "millimetres": (OBJECTS, in_millimetres, ["object_poses.csv", "millimet"]),
 }
 
