@@ -102,17 +102,21 @@ def read_arguments(program: str, kind: type, argv: Sequence[str]) -> Any:
 
 
 def _unboxed(text: str) -> str:
-    """Return the sentences inside tyro's box, without the frame and the pointer to the help."""
+    """Return the sentences inside tyro's box, without the frame, its title and the pointer to the help.
+
+    Where the terminal knows ASCII only there is no frame: the title stands above a line of dashes.
+    """
     sections: list[list[str]] = [[]]
     for line in text.splitlines():
         if line.startswith(("╭", "╰")):
             continue
         words = line.strip("│ ")
-        if words.startswith("──"):
+        if words.startswith(("──", "-----")):
             sections.append([])
         else:
             sections[-1].append(words)
-    sentences = [" ".join(section) for section in sections]
+    framed = "╭" in text
+    sentences = [" ".join(section).strip() for section in (sections if framed else sections[1:])]
     told = [s for s in sentences if s and not s.startswith(("For full helptext", "Argument helptext"))]
     return "; ".join(told) or "these arguments cannot be read"
 

@@ -6,6 +6,7 @@ import signal
 import subprocess
 import sys
 from dataclasses import dataclass
+from io import BytesIO, TextIOWrapper
 from types import ModuleType
 
 import pytest
@@ -88,6 +89,16 @@ def test_wrong_arguments_are_one_line_and_status_1(arguments, said, planted, cap
     line = one_line(capsys)
     assert said in line
     assert "--help" in line or "one of" in line
+
+
+@pytest.mark.parametrize("arguments", [["plant", "--bogus", "3"], ["plant", "--count", "many"]])
+def test_wrong_arguments_are_told_alike_where_there_is_only_ascii(arguments, planted, capsys, monkeypatch):
+    planted(lambda arguments: pytest.fail("must not run"))
+    assert main(arguments) == 1
+    usual = one_line(capsys)
+    monkeypatch.setattr(sys, "stdout", TextIOWrapper(BytesIO(), encoding="ascii"))
+    assert main(arguments) == 1
+    assert one_line(capsys) == usual
 
 
 def test_a_user_mistake_is_one_line_and_status_1(planted, capsys):
