@@ -111,71 +111,97 @@ def record(problem: Any, options: FuseOptions) -> list[Keyframe]:
     return tape
 
 
-def record_factors(problem: Any, options: FuseOptions) -> list[Keyframe]:
-    """Return the same with a maker of every factor: those that a graph has whose factors can be called again."""
-    made: list[list[Make]] = [[]]
-    covariances: list[Any] = []
-    steps: list[Any] = []
+class FactorNotes:
+    """How to make each factor again, noted while the estimator makes it, keyframe by keyframe."""
 
-    def note_robust(kernel: Any, covariance: Any) -> Any:
-        covariances.append(covariance.copy())
+    def __init__(self, options: FuseOptions) -> None:
+        self.made: list[list[Make]] = [[]]
+        self._kernel = options.graph
+        self._covariance: Any = None
+        self._parameters: tuple[Any, Any] = None, None
+        self._samples: list[Any] = []
+
+    def robust(self, kernel: Any, covariance: Any) -> Any:
+        """Note the covariance that the next CustomFactor will have."""
+        self._covariance = covariance.copy()
         return robust(kernel, covariance)
 
-    custom, links = gtsam.CustomFactor, MotionChain.link
-    combined, preintegrated = gtsam.CombinedImuFactor, gtsam.PreintegratedCombinedMeasurements
+    def custom(self, make: type) -> Callable[..., Any]:
+        """Return what makes a CustomFactor and notes it."""
 
-    def note_custom(_: Any, keys: Any, error: Any) -> Any:
-        covariance = covariances[-1]
-        made[-1].append(lambda: custom(robust(options.graph, covariance), keys, error))
-        return made[-1][-1]()
+        def noted(_: Any, keys: Any, error: Any) -> Any:
+            covariance = self._covariance
+            self.made[-1].append(lambda: make(robust(self._kernel, covariance), keys, error))
+            return self.made[-1][-1]()
 
-    def note_bias(*arguments: Any) -> Any:
-        made[-1].append(lambda: bias_factor(*arguments[:4]))
+        return noted
+
+    def bias(self, *arguments: Any) -> Any:
+        """Make the step of an object's bias and note it."""
+        self.made[-1].append(lambda: bias_factor(*arguments[:4]))
         return bias_factor(*arguments)
 
-    class Noted(preintegrated):  # type: ignore[misc, valid-type]
-        def __init__(self, parameters: Any, bias: Any) -> None:
-            steps[:] = [(parameters, bias)]
-            super().__init__(parameters, bias)
+    def preintegrated(self, make: type) -> type:
+        """Return a preintegration that notes its samples."""
+        notes = self
 
-        def integrateMeasurement(self, *step: Any) -> None:
-            steps.append(tuple(np.array(one) for one in step))
-            super().integrateMeasurement(*step)
+        class Noted(make):  # type: ignore[misc, valid-type]
+            def __init__(self, parameters: Any, bias: Any) -> None:
+                notes._parameters, notes._samples = (parameters, bias), []
+                super().__init__(parameters, bias)
 
-    def note_link(self: MotionChain, *arguments: Any) -> Any:
-        factor, predicted = links(self, *arguments)
-        (parameters, bias), *samples = steps
-        keys = list(factor.keys())
+            def integrateMeasurement(self, *step: Any) -> None:
+                notes._samples.append(tuple(np.array(one) for one in step))
+                super().integrateMeasurement(*step)
 
-        def make() -> Any:
-            summed = preintegrated(parameters, bias)
-            for force, rate, seconds in samples:
-                summed.integrateMeasurement(force, rate, seconds)
-            return combined(*keys, summed)
+        return Noted
 
-        made[-1].append(make)
-        return factor, predicted
+    def link(self, make: Callable[..., Any], preintegrated: type) -> Callable[..., Any]:
+        """Return what makes the IMU's factor and notes it with its preintegration."""
 
-    take = graph_builder.GraphBuilder.take
+        def noted(chain: MotionChain, *arguments: Any) -> Any:
+            factor, predicted = make(chain, *arguments)
+            parameters, samples, keys = self._parameters, self._samples, list(factor.keys())
 
-    def note_take(self: graph_builder.GraphBuilder) -> Any:
-        every = [self.graph.at(i) for i in range(self.graph.size())]
-        priors = every if len(made) == 1 else [f for f in every if isinstance(f, gtsam.PriorFactorVector)]
-        made[-1] += [lambda prior=prior: prior for prior in priors]  # few, and ready
-        made.append([])
-        return take(self)
+            def again() -> Any:
+                summed = preintegrated(*parameters)
+                for force, rate, seconds in samples:
+                    summed.integrateMeasurement(force, rate, seconds)
+                return gtsam.CombinedImuFactor(*keys, summed)
 
+            self.made[-1].append(again)
+            return factor, predicted
+
+        return noted
+
+    def take(self, make: Callable[..., Any]) -> Callable[..., Any]:
+        """Return what hands a keyframe's factors over and notes those that are priors: few, and ready."""
+
+        def noted(builder: graph_builder.GraphBuilder) -> Any:
+            every = [builder.graph.at(i) for i in range(builder.graph.size())]
+            first = len(self.made) == 1
+            priors = [factor for factor in every if first or isinstance(factor, gtsam.PriorFactorVector)]
+            self.made[-1] += [lambda prior=prior: prior for prior in priors]
+            self.made.append([])
+            return make(builder)
+
+        return noted
+
+
+def record_factors(problem: Any, options: FuseOptions) -> list[Keyframe]:
+    """Return the same with a maker of every factor: those that a graph has whose factors can be called again."""
+    notes, preintegrated = FactorNotes(options), gtsam.PreintegratedCombinedMeasurements
     with (
-        patch.object(graph_factors, "robust", note_robust),
-        patch.object(graph_factors.gtsam, "CustomFactor", note_custom),
-        patch.object(graph_builder, "bias_factor", note_bias),
-        patch.object(graph_factors.gtsam, "PreintegratedCombinedMeasurements", Noted),
-        patch.object(MotionChain, "link", note_link),
-        patch.object(graph_builder.GraphBuilder, "take", note_take),
+        patch.object(graph_factors, "robust", notes.robust),
+        patch.object(graph_factors.gtsam, "CustomFactor", notes.custom(gtsam.CustomFactor)),
+        patch.object(graph_builder, "bias_factor", notes.bias),
+        patch.object(gtsam, "PreintegratedCombinedMeasurements", notes.preintegrated(preintegrated)),
+        patch.object(MotionChain, "link", notes.link(MotionChain.link, preintegrated)),
+        patch.object(graph_builder.GraphBuilder, "take", notes.take(graph_builder.GraphBuilder.take)),
     ):
         again = replace(options, graph=replace(options.graph, relinearize_every=10**9))  # able to, but never does
         tape = record(problem, again)
-    for keyframe, factors in zip(tape, made, strict=False):
+    for keyframe, factors in zip(tape, notes.made, strict=False):
         keyframe.factors = factors
     return tape
 

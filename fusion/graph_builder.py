@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Iterable
-from dataclasses import dataclass, replace
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
 
 import gtsam
 import numpy as np
@@ -19,6 +19,7 @@ from fusion.graph_model import bias_step
 from fusion.graph_motion import MotionChain
 from fusion.graph_odometry import OdometryStep, odometry_factor
 from fusion.graph_variables import (
+    Arrangement,
     CloneVariable,
     Variable,
     errors_of,
@@ -98,6 +99,10 @@ class GraphBuilder:
         self.model = Model(layout, x.copy(), chain.with_imu, options)
         self.keyframe, self.stamp_ns, self.x, self.origin = -1, 0, x.copy(), x.copy()
         self.fixed = fixed
+        self._spreads = slice(layout.spread_start, None)
+        self._own: list[Variable] = []
+        self._arrangement = Arrangement([])
+        self._arranged = (0, 0, False)
         self.chains: dict[tuple[int, int], BiasChain] = {}
         self._statics: dict[int, Variable] = {}
         self._bias_count = 0
@@ -125,7 +130,14 @@ class GraphBuilder:
     @property
     def newest(self) -> list[Variable]:
         """The newest keyframe's variables and those that last."""
-        return keyframe_variables(self.keyframe, self.chain.with_imu) + self.lasting
+        return self._own + self.lasting
+
+    def arrangement(self, newest: Sequence[Variable]) -> Arrangement:
+        """Return where the newest variables stand; only more of them, or the last odometry's pose, change that."""
+        arranged = len(newest), len(self._statics), 0 <= self.clone < self.keyframe  # no other goes within a graph
+        if arranged != self._arranged:
+            self._arrangement, self._arranged = Arrangement(newest), arranged
+        return self._arrangement
 
     @property
     def statics(self) -> list[Variable]:
@@ -155,6 +167,7 @@ class GraphBuilder:
         values are those of x, or of start_from.
         """
         self._clear()
+        self._arranged = (0, 0, False)
         self.x, layout, self.clone = x.copy() if start_from is None else start_from.copy(), self.layout, -1
         self.origin = self.x.copy()
         self._statics = {variable.key: variable for variable in static_variables(layout)}
@@ -168,7 +181,7 @@ class GraphBuilder:
         for k in range(layout.n_objects):
             for kind in range(layout.bias_kinds):
                 self.chains[k, kind] = self._first_bias(k, kind, P)
-        first = keyframe_variables(self.keyframe, self.chain.with_imu) + list(self._statics.values())
+        first = self._own + list(self._statics.values())
         first += [chain.variable for chain in self.chains.values() if chain.begun]
         self.graph.add(joint_prior(first, x, P))
 
@@ -185,19 +198,21 @@ class GraphBuilder:
         return chain
 
     def _new_bias(self, chain: BiasChain) -> Variable:
-        variable = replace(chain.variable, key=object_bias_key(self._bias_count))
+        variable = Variable(object_bias_key(self._bias_count), chain.variable.errors, chain.variable.at)
         self._bias_count += 1
         self._add(variable)
         return variable
 
     def _add(self, variable: Variable) -> None:
         variable.insert(self.values, self.x)
-        self.origin[variable.place] = self.x[variable.place]
+        place = variable.place
+        self.origin[place] = self.x[place]
         self.keyframes[variable.key] = self.keyframe
 
     def _add_keyframe(self, stamp_ns: int) -> None:
         self.keyframe, self.stamp_ns = self.keyframe + 1, stamp_ns
-        for variable in keyframe_variables(self.keyframe, self.chain.with_imu):
+        self._own = keyframe_variables(self.keyframe, self.chain.with_imu)
+        for variable in self._own:
             self._add(variable)
 
     def add_keyframe(self, stamp_ns: int, x: Array | None = None) -> None:
@@ -232,10 +247,14 @@ class GraphBuilder:
 
         rotations and covariances are those that the filter used, weights those that the kernel gives.
         """
-        every, model = slice(which.start, which.stop), self.model
-        passed, kinds = columns.decisions[every] & ACCEPTED, columns.kinds[every]
-        passed[kinds == ODOMETRY_STEP] = 0
-        seen = dict.fromkeys(columns.objects[every][(passed > 0) & (kinds == OBJECT_POSE)].tolist())
+        every = slice(which.start, which.stop)
+        passed, kinds = columns.decisions[every] & ACCEPTED, columns.kinds[every].tolist()
+        seen: dict[int, None] = {}
+        for n, (kind, k) in enumerate(zip(kinds, columns.objects[every].tolist(), strict=True)):
+            if kind == ODOMETRY_STEP:
+                passed[n] = 0
+            elif kind == OBJECT_POSE and passed[n]:
+                seen[k] = None
         private = {k: self._private_variables(k) for k in seen}
         own, counts, shared, count = linearise(
             which.start,
@@ -251,20 +270,22 @@ class GraphBuilder:
             not self.chain.with_imu,
             self.x,
             self.origin,
-            model.integers,
+            self.model.integers,
         )
         moved = int(columns.stamps[which.start]) != self.stamp_ns
         common = common_variables(self.layout, self.keyframe, self.chain.with_imu, moved)
         first = own.shape[1]
-        for k, variables in private.items():
-            if counts[k]:
-                self.graph.add(
-                    linear_factor(
-                        own[k, : counts[k]], [*variables, *((key, first + at, size) for key, at, size in common)]
-                    )
-                )
-        if count:
-            self.graph.add(linear_factor(shared[:count], common))
+        behind = [(key, first + at, size) for key, at, size in common]
+        blocks = [(own[k, : counts[k]], [*variables, *behind]) for k, variables in private.items() if counts[k]]
+        if count and blocks:  # one factor less
+            rows, variables = blocks[-1]
+            together = np.zeros((len(rows) + count, rows.shape[1]))
+            together[: len(rows)], together[len(rows) :, first:] = rows, shared[:count]
+            blocks[-1] = together, variables
+        elif count:
+            blocks = [(shared[:count], common)]
+        for rows, variables in blocks:
+            self.graph.add(linear_factor(rows, variables))
 
     def _private_variables(self, k: int) -> list[tuple[int, int, int]]:
         """Return key, first column and size of what an object's measurements alone see; add what there is not yet."""
@@ -284,7 +305,7 @@ class GraphBuilder:
     def follow_spreads(self, x: Array) -> None:
         """Let the objects' biases spread, from here on, as a nominal array of the filter says."""
         for own in (self.x, self.origin, self.model.x):
-            own[self.layout.spread_start :] = x[self.layout.spread_start :]
+            own[self._spreads] = x[self._spreads]
 
     def _meet(self, k: int) -> None:
         """Add an object's pose where it is seen for the first time."""

@@ -30,6 +30,7 @@ Array = NDArray[np.float64]
 Error = Callable[[gtsam.CustomFactor, gtsam.Values, "list[Array] | None"], Array]
 
 
+_IDENTITY, _ZEROS = np.eye(6), np.zeros(6)
 _NOWHERE = np.eye(4, order="F")  # as gtsam gives matrices: another order would be compiled once more
 
 
@@ -116,13 +117,13 @@ def bias_factor(first: int, second: int, phi: Array, sigma: Array, gap: Array | 
 
     gap: phi b_first - b_second where they start, for a graph that linearises nothing twice.
     """
-    A_1, A_2, b = np.diag(-phi / sigma), np.diag(1.0 / sigma), np.zeros(6) if gap is None else gap / sigma
-    linear = gtsam.JacobianFactor(first, A_1, second, A_2, b, unit_noise(6))
+    b = _ZEROS if gap is None else gap / sigma
+    linear = gtsam.JacobianFactor(first, _IDENTITY * (-phi / sigma), second, _IDENTITY / sigma, b, unit_noise(6))
     if gap is not None:
         return gtsam.LinearContainerFactor(linear)
     zeros = gtsam.Values()
-    zeros.insert(first, np.zeros(6))
-    zeros.insert(second, np.zeros(6))
+    zeros.insert(first, _ZEROS)
+    zeros.insert(second, _ZEROS)
     return gtsam.LinearContainerFactor(linear, zeros)
 
 

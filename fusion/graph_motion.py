@@ -22,6 +22,7 @@ Ints = NDArray[np.int64]
 _SMALLEST_DENSITY = 1e-8  # a noise density of zero has no information matrix
 _INTEGRATION = 1e-5  # m/sqrt(s): what the midpoint rule leaves
 _STILL = np.zeros(6)
+_IDENTITY = np.eye(3)
 
 
 @dataclass(frozen=True)
@@ -85,14 +86,13 @@ class MotionChain:
 
         A gap inside raises the densities of the whole stretch so far that it explains what the gap may have held.
         """
-        steps = np.empty((int(np.searchsorted(self.stamps_ns, [start, end]) @ [-1, 1]) + 2, 7))
+        last = int(self.stamps_ns.searchsorted(end))
+        steps = np.empty((last - int(self.stamps_ns.searchsorted(start)) + 2, 7))
         biases = np.concatenate([bias.gyroscope(), bias.accelerometer()])
         longest = self.options.gap.longest_s
         count, gaps = imu_between(self.stamps_ns, self.values, start, end, biases, longest, steps)
-        row = self.values[int(np.searchsorted(self.stamps_ns, end))]
-        summed = gtsam.PreintegratedCombinedMeasurements(
-            self._parameters(gaps / ((end - start) * 1e-9), row, gravity), bias
-        )
+        params = self._parameters(gaps / ((end - start) * 1e-9), self.values[last], gravity)
+        summed = gtsam.PreintegratedCombinedMeasurements(params, bias)
         for seconds, rate, force in zip(steps[:count, 0].tolist(), steps[:, 1:4], steps[:, 4:7], strict=False):
             summed.integrateMeasurement(force, rate, seconds)
         return summed
@@ -104,12 +104,12 @@ class MotionChain:
         gyro = density_squared(self.noise.gyroscope_noise_density, row, GYRO_SQUARES, measured)
         accel = density_squared(self.noise.accelerometer_noise_density, row, ACCEL_SQUARES, measured)
         gyro, accel = gyro + gap_s * gap.angular_rate**2, accel + gap_s * gap.acceleration**2
-        floor, identity = _SMALLEST_DENSITY**2, np.eye(3)
-        params.setGyroscopeCovariance((gyro + floor) * identity)
-        params.setAccelerometerCovariance((accel + floor) * identity)
-        params.setBiasOmegaCovariance((self.noise.gyroscope_random_walk**2 + floor) * identity)
-        params.setBiasAccCovariance((self.noise.accelerometer_random_walk**2 + floor) * identity)
-        params.setIntegrationCovariance(_INTEGRATION**2 * identity)
+        floor = _SMALLEST_DENSITY**2
+        params.setGyroscopeCovariance((gyro + floor) * _IDENTITY)
+        params.setAccelerometerCovariance((accel + floor) * _IDENTITY)
+        params.setBiasOmegaCovariance((self.noise.gyroscope_random_walk**2 + floor) * _IDENTITY)
+        params.setBiasAccCovariance((self.noise.accelerometer_random_walk**2 + floor) * _IDENTITY)
+        params.setIntegrationCovariance(_INTEGRATION**2 * _IDENTITY)
         return params
 
 

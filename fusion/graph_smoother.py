@@ -163,26 +163,30 @@ class FixedLagSmoother:
         """
         builder, variables = self.builder, self.builder.newest
         root, step = newest_root(self._isam, [variable.key for variable in variables])
-        rows, first = [], 0
-        for variable in variables:
-            part, first = slice(first, first + variable.size), first + variable.size
-            builder.x[variable.place] = m.x[variable.place] = variable.moved(builder.origin, step[part])
-            rows.append(variable.rows_to_filter(builder.x, root[part]))
-        at = np.array([i for variable in variables for i in variable.errors])
-        J_root = np.concatenate(rows)
-        P, begun = J_root @ J_root.T, [c for c in builder.chains.values() if c.begun]
-        for n, chain in enumerate(begun):  # they are the last of the newest
-            if builder.unchanged(chain):
-                continue
-            phi, sigma = builder.step(chain)
-            first, place = 6 * (n - len(begun)) + len(at), chain.variable.at
-            m.x[place : place + 6] *= phi
-            P[first : first + 6] *= phi[:, None]
-            P[:, first : first + 6] *= phi
-            P[range(first, first + 6), range(first, first + 6)] += sigma**2
-        m.P[at[:, None], at] = 0.5 * (P + P.T)
+        arrangement = builder.arrangement(variables)
+        arrangement.move(builder.x, builder.origin, step)
+        arrangement.copy(builder.x, m.x)
+        J_root = arrangement.rows_to_filter(builder.x, root)
+        m.P[arrangement.errors[:, None], arrangement.errors] = self._carried(J_root @ J_root.T, m.x)
         if builder.clone == builder.keyframe:
             clone_pose(m.x, m.P, m.layout)
+
+    def _carried(self, P: Array, x: Array) -> Array:
+        """Return a covariance of the newest variables, and change x, with all object biases as they are by now."""
+        builder = self.builder
+        begun = [chain for chain in builder.chains.values() if chain.begun]
+        if all(map(builder.unchanged, begun)):
+            return P
+        left, variances, first = np.ones(len(P)), np.zeros(len(P)), len(P) - 6 * len(begun)  # the last of the newest
+        for n, chain in enumerate(begun):
+            if not builder.unchanged(chain):
+                part, at = slice(first + 6 * n, first + 6 * n + 6), chain.variable.at
+                left[part], sigma = builder.step(chain)
+                x[at : at + 6] *= left[part]
+                variances[part] = sigma**2
+        P *= left[:, None] * left
+        P.reshape(-1)[:: len(P) + 1] += variances
+        return P
 
 
 def isam_parameters(options: Graph) -> gtsam.ISAM2Params:
@@ -221,7 +225,7 @@ def add_measurements(builder: GraphBuilder, walk: Walk, which: range) -> None:
         return
     c, layout = walk.columns, builder.layout
     whole = c.stamps[which[0]] == builder.stamp_ns and not (layout.extrinsics or layout.time_offset)
-    native = whole and CAMERA_POSE in c.kinds[which.start : which.stop]  # gtsam has a factor for it
+    native = whole and CAMERA_POSE in c.kinds[which.start : which.stop].tolist()  # gtsam has a factor for it
     if builder.fixed and not native:
         builder.add_linearised(c, walk.rotations, walk.covariances, walk.weights, which)
     else:

@@ -29,6 +29,7 @@ from fusion.nav_state import (
 Array = NDArray[np.float64]
 
 EXTRINSICS, OFFSET, GRAVITY_KEY = (int(gtsam.symbol(name, 0)) for name in "edg")
+_POSES, _VELOCITIES, _IMU_BIASES, _OBJECTS, _OBJECT_BIASES = (int(gtsam.symbol(name, 0)) for name in "xvboc")
 _EYE = np.eye(3)
 _SMALLEST_VARIANCE = 1e-14  # an exact prior has no information matrix
 _LENGTH_OF_GRAVITY = 1e-3  # m/s^2
@@ -36,27 +37,27 @@ _LENGTH_OF_GRAVITY = 1e-3  # m/s^2
 
 def pose_key(k: int) -> int:
     """Return the key of keyframe k's pose."""
-    return int(gtsam.symbol("x", k))
+    return _POSES + k
 
 
 def velocity_key(k: int) -> int:
     """Return the key of keyframe k's velocity."""
-    return int(gtsam.symbol("v", k))
+    return _VELOCITIES + k
 
 
 def imu_bias_key(k: int) -> int:
     """Return the key of keyframe k's IMU bias."""
-    return int(gtsam.symbol("b", k))
+    return _IMU_BIASES + k
 
 
 def object_key(k: int) -> int:
     """Return the key of an object's pose."""
-    return int(gtsam.symbol("o", k))
+    return _OBJECTS + k
 
 
 def object_bias_key(count: int) -> int:
     """Return the key of one object's bias at one keyframe; they are counted through."""
-    return int(gtsam.symbol("c", count))
+    return _OBJECT_BIASES + count
 
 
 def block_diagonal(blocks: Sequence[Array]) -> Array:
@@ -104,13 +105,18 @@ class Variable:
         """Its place in the nominal array."""
         return slice(self.at, self.at + self.size)
 
+    @property
+    def added(self) -> Sequence[int] | None:
+        """What of a step is added to each number in its place, which is its error too; None: it is not that simple."""
+        return range(self.size)
+
     def read(self, values: gtsam.Values, x: Array) -> None:
         """Write its value into the nominal array."""
         x[self.at : self.at + self.size] = values.atVector(self.key)
 
     def moved(self, x: Array, step: Array) -> Array:
         """Return what stands in its place of the nominal array after a step in gtsam's tangent."""
-        return np.asarray(x[self.place] + step)
+        return np.asarray(x[self.at : self.at + len(step)] + step)
 
     def to_filter(self, x: Array) -> Array:
         """Return the derivative of the filter's errors by gtsam's tangent."""
@@ -147,10 +153,15 @@ class PoseVariable(Variable):
         """Its place in the nominal array."""
         return slice(self.at, self.at + OBJECT_SIZE)
 
+    @property
+    def added(self) -> None:
+        """Nothing: a pose is turned and shifted."""
+        return None
+
     def moved(self, x: Array, step: Array) -> Array:
         """Return what stands in its place of the nominal array after a step in gtsam's tangent."""
-        T = pose3(x, self.at).retract(step).matrix()
-        return np.concatenate([T[:3, :3].ravel(), T[:3, 3]])
+        T = pose3(x, self.at).retract(step)
+        return np.concatenate((*T.rotation().matrix(), T.translation()))
 
     def to_filter(self, x: Array) -> Array:
         """Return the derivative of the filter's errors by gtsam's tangent."""
@@ -158,7 +169,7 @@ class PoseVariable(Variable):
 
     def rows_to_filter(self, x: Array, rows: Array) -> Array:
         """Return to_filter(x) @ rows."""
-        return np.concatenate([rows[:3], x[self.at : self.at + 9].reshape(3, 3) @ rows[3:]])
+        return np.concatenate((rows[:3], x[self.at : self.at + 9].reshape(3, 3) @ rows[3:]))
 
 
 class CloneVariable(PoseVariable):
@@ -175,6 +186,11 @@ class CloneVariable(PoseVariable):
 
 class ImuBiasVariable(Variable):
     """The IMU's bias: [accelerometer, gyroscope] in gtsam, [gyroscope, accelerometer] in the filter."""
+
+    @property
+    def added(self) -> Sequence[int]:
+        """What of a step is added to each number in its place, which is its error too."""
+        return 3, 4, 5, 0, 1, 2
 
     def insert(self, values: gtsam.Values, x: Array) -> None:
         """Add it to values with what stands in the nominal array."""
@@ -195,7 +211,7 @@ class ImuBiasVariable(Variable):
 
     def rows_to_filter(self, x: Array, rows: Array) -> Array:
         """Return to_filter(x) @ rows."""
-        return np.concatenate([rows[3:], rows[:3]])
+        return np.concatenate((rows[3:], rows[:3]))
 
 
 class GravityVariable(Variable):
@@ -205,6 +221,11 @@ class GravityVariable(Variable):
     def size(self) -> int:
         """Size of its tangent in gtsam."""
         return 3
+
+    @property
+    def added(self) -> None:
+        """Nothing: its errors are two angles."""
+        return None
 
     def to_filter(self, x: Array) -> Array:
         """Return the derivative of the filter's errors by gtsam's tangent."""
@@ -222,6 +243,51 @@ class GravityVariable(Variable):
         """Return the covariance in gtsam's tangent that a prior has beside that of the filter's errors."""
         g = x[GRAVITY : GRAVITY + 3]
         return super().slack(x) + _LENGTH_OF_GRAVITY**2 * np.outer(g, g) / (g @ g)
+
+
+class Arrangement:
+    """Where variables, one behind the other, stand in the filter's nominal array and error state, whatever their keys.
+
+    What a step is only added to is written all at once: most variables are of that kind, and numpy's calls are what a
+    keyframe's few numbers cost.
+    """
+
+    def __init__(self, variables: Sequence[Variable]) -> None:
+        self.errors = np.array([i for variable in variables for i in variable.errors], dtype=np.int64)
+        places, sources, rows, everywhere = list[int](), list[int](), list[int](), list[int]()
+        self._turned: list[tuple[Variable, slice, slice]] = []
+        first = row = 0
+        for v in variables:
+            n = len(v.errors)
+            if v.added is None:
+                self._turned.append((v, slice(first, first + v.size), slice(row, row + n)))
+            else:
+                places += range(v.at, v.at + n)
+                sources += [first + i for i in v.added]
+                rows += range(row, row + n)
+            everywhere += range(v.place.start, v.place.stop)
+            first, row = first + v.size, row + n
+        self._places, self._sources, self._rows, self._everywhere = map(np.array, (places, sources, rows, everywhere))
+
+    def move(self, x: Array, origin: Array, step: Array) -> None:
+        """Write into the nominal array x what comes of a step in gtsam's tangents from another one."""
+        if len(self._places):
+            x[self._places] = origin[self._places] + step[self._sources]
+        for variable, tangent, _ in self._turned:
+            x[variable.place] = variable.moved(origin, step[tangent])
+
+    def rows_to_filter(self, x: Array, rows: Array) -> Array:
+        """Return rows of gtsam's tangents as rows of the filter's errors, at x."""
+        found = np.empty((len(self.errors), rows.shape[1]))
+        if len(self._rows):
+            found[self._rows] = rows[self._sources]
+        for variable, tangent, errors in self._turned:
+            found[errors] = variable.rows_to_filter(x, rows[tangent])
+        return found
+
+    def copy(self, source: Array, target: Array) -> None:
+        """Copy the variables from one nominal array to another."""
+        target[self._everywhere] = source[self._everywhere]
 
 
 def keyframe_variables(k: int, with_imu: bool) -> list[Variable]:
