@@ -135,34 +135,34 @@ def largest_agreement(
     by_places: bool,
     inlier: Ints,
     scratch: Array,
-) -> tuple[int, float, int]:
+) -> tuple[int, float, int, int]:
     """Find the correction most votes agree on; write it to C (9,), d (3,), v (3,).
 
     by_places: votes agree if their object is at its place, however it seems turned; then gravity must be felt.
 
-    Returns how many votes agree and their span (s), and how many objects are at their places: in half of their votes,
-    and in half as many as a start needs.
+    Returns how many votes agree and their span (s), how many objects are at their places, and how many agree whole:
+    in half of their votes, and in half as many as a start needs.
 
     votes is a ring whose entries first..head-1 (modulo its length, a power of two) count; inlier (ring length) marks
     what of each agrees. origin (6,) is the position and velocity that the correction replaces; v is fitted to the
-    agreeing votes, so that at stamp `now` position and velocity become d and v. scratch holds 224 floats.
+    agreeing votes, so that at stamp `now` position and velocity become d and v. scratch holds 256 floats.
     """
     mask, cosine = len(stamps) - 1, math.cos(options[MAX_ANGLE])
     seed = _search(
         votes, stamps, first, head, now, up, origin, gravity, options, C, d, v, 0.0, False, by_places, inlier, scratch
     )
     if seed < 0:
-        return 0, 0.0, 0
+        return 0, 0.0, 0, 0
     for j in range(3):
         v[j] = 0.0
     what = AT_ITS_PLACE if by_places else WHOLE
     _mark(votes, stamps, first, head, now, origin, gravity, options, seed, C, d, v, -1.0, what, inlier, scratch)
     for _ in range(3):
         _refine(votes, stamps, first, head, now, up, origin, gravity, options, C, d, v, what, inlier, scratch)
-    count, objects, oldest, newest = 0, 0, now, stamps[seed]
-    at_place, seen = scratch[160:192], scratch[192:224]
+    count, objects, alike, oldest, newest = 0, 0, 0, now, stamps[seed]
+    at_place, whole, seen = scratch[160:192], scratch[192:224], scratch[224:256]
     for k in range(32):
-        at_place[k] = seen[k] = 0.0
+        at_place[k] = whole[k] = seen[k] = 0.0
     for a in range(first, head):
         j = a & mask
         reach = options[MAX_DISTANCE] + options[MAX_LEVER] * votes[j, VOTE_DISTANCE]
@@ -170,12 +170,15 @@ def largest_agreement(
         k = int(votes[j, VOTE_OBJECT])
         if k >= 0:
             seen[k & 31] += 1.0
-            at_place[k & 31] += agrees & AT_ITS_PLACE
+            at_place[k & 31] += agrees & AT_ITS_PLACE != 0
+            whole[k & 31] += agrees & WHOLE != 0
         if inlier[j] & what:
             count, oldest, newest = count + 1, min(oldest, stamps[j]), max(newest, stamps[j])
     for k in range(32):
-        objects += at_place[k] >= 0.5 * max(options[MIN_VOTES], seen[k])
-    return count, max(0.0, (newest - oldest) * 1e-9), objects
+        enough = 0.5 * max(options[MIN_VOTES], seen[k])
+        objects += at_place[k] >= enough
+        alike += whole[k] >= enough
+    return count, max(0.0, (newest - oldest) * 1e-9), objects, alike
 
 
 @njit(cache=True)

@@ -169,9 +169,9 @@ class Start:
     pose: tuple[float, float, float, float, float, float, float] | None = None
     """Where the IMU (without one, the camera) is in the world at the first detection: x y z, m, and the quaternion
     qx qy qz qw. The filter then starts there, standing still, with the spread of --prior. None: from votes."""
-    min_votes: int = 8
+    min_votes: int = 7
     """Votes that must agree before anything is published."""
-    min_share: float = 0.4
+    min_share: float = 0.3
     """Share of the window's votes that must agree."""
     min_objects: int = 3
     """Where so many objects are where the map says from one pose, however they seem turned, their places will do,"""
@@ -179,8 +179,9 @@ class Start:
     """if this share of the window's detections shows them there."""
     lead: float = 1.2
     """A pose is believed if it has so many times the support of any quite other one."""
-    min_span_s: float = 0.4
-    """Time that they must span, s; none where min_objects are at their places and no time offset is estimated."""
+    min_span_s: float = 0.3
+    """Time that they must span, s; none where two objects agree whole, or min_objects are at their places, and no time
+    offset is estimated."""
     window_s: float = 1.0
     """Votes so young count, s."""
     longest_window_s: float = 8.0
@@ -193,7 +194,7 @@ class Start:
     """plus this share of the object's distance,"""
     max_speed: float = 0.3
     """plus so much per second between them, m/s."""
-    max_tilt_deg: float = 12.0
+    max_tilt_deg: float = 8.0
     """A vote that tilts the measured gravity by more is refused, deg."""
     lost_window_s: float = 4.0
     """The filter is lost if in this time, s,"""

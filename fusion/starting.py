@@ -166,7 +166,7 @@ def _first_vote(m: Memory, window_s: float, wanted: int) -> int:
 
 
 @njit(cache=True)
-def _agreement(m: Memory, w: Work, first: int, by_places: bool) -> tuple[int, float, int]:
+def _agreement(m: Memory, w: Work, first: int, by_places: bool) -> tuple[int, float, int, int]:
     """Return what `largest_agreement` says of the votes since `first`; leave their correction in w.step[96:117].
 
     The integrated velocity may be right (the votes jump) or wrong (there were none for long), so both are tried.
@@ -179,7 +179,7 @@ def _agreement(m: Memory, w: Work, first: int, by_places: bool) -> tuple[int, fl
 @njit(cache=True)
 def _agreement_beside(
     m: Memory, w: Work, first: int, share_of_velocity: float, by_places: bool
-) -> tuple[int, float, int]:
+) -> tuple[int, float, int, int]:
     C, d, v, origin = w.step[96:105], w.step[105:108], w.step[108:111], w.step[111:117]
     for i in range(3):
         origin[i] = m.x[POSITION + i]
@@ -248,16 +248,16 @@ def _agree_with_given_pose(m: Memory, w: Work) -> None:
 def _found_by_votes(m: Memory, w: Work) -> bool:
     """Tell whether enough votes agree and have no rival; leave their correction in w.step[96:117]."""
     first = _first_vote(m, m.start[START_WINDOW_S], 2 * int(m.start[MIN_VOTES]))
-    count, span, objects = _agreement(m, w, first, False)
+    count, span, objects, alike = _agreement(m, w, first, False)
     total = m.counters[VOTE_HEAD] - first
     if count < max(m.start[MIN_VOTES], m.start[MIN_SHARE] * total):
         if objects_seen(m.votes, first, m.counters[VOTE_HEAD]) < m.start[MIN_OBJECTS] or m.start[MAX_TILT] >= math.pi:
             return False
-        count, span, objects = _agreement(m, w, first, True)
+        count, span, objects, alike = _agreement(m, w, first, True)
         if objects < m.start[MIN_OBJECTS] or count < max(m.start[MIN_VOTES], m.start[MIN_PLACES] * total):
             return False
-    # Objects at their places do without a span; but a velocity that is not known yet looks like a time offset.
-    at_once = objects >= m.start[MIN_OBJECTS] and m.layout[AT_TIME_OFFSET] < 0
+    # Objects that bear each other out do without a span; but a velocity not known yet looks like a time offset.
+    at_once = (objects >= m.start[MIN_OBJECTS] or alike > 1) and m.layout[AT_TIME_OFFSET] < 0
     settled = span >= m.start[START_MIN_SPAN_S] or at_once
     return settled and not _is_contested(m, w, first)
 

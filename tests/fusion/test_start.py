@@ -125,6 +125,18 @@ def test_places_start_the_filter_where_rotations_are_wrong():
         fuse(log, votes_only)
 
 
+def test_two_objects_that_agree_whole_need_no_span_and_one_does():
+    patient = replace(OPTIONS, start=replace(OPTIONS.start, min_span_s=0.8))
+    when, distance, angle = start_of(table([None, None]), patient)
+    assert when < 0.5
+    assert distance < 0.1
+    assert angle < 6.0
+    assert start_of(table([None]), patient)[0] >= 0.8
+    turned_apart = turned(table([None, None]), 25.0)  # each is alone with what it says
+    with pytest.raises(InputError, match="never started"):
+        fuse(turned_apart, patient)
+
+
 def test_one_object_of_which_every_other_detection_is_flipped_starts_nothing():
     log = table([None])
     poses = log.object_poses[""]
