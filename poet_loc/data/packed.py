@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from poet_loc.core.input_error import InputError
+from poet_loc.data.coloured_points import blend, spread_over
 from poet_loc.io.bop import read_bop_scene
 from poet_loc.io.bop_models import read_models_info
 from poet_loc.io.ply import read_model_mesh
@@ -84,6 +85,10 @@ class Sample:
     """(n,) visible share before augmentation."""
     surface: Array
     """(h, w, 3) object coordinates over the diameter at the centres of the stride cells; nan: no object."""
+    rows: NDArray[np.int64]
+    """(n,) which of the scene's objects these are."""
+    turn: Array
+    """(3, 3) from the camera axes of the packed image to those of this one."""
 
 
 def load_models(folder: Path, count: int = 400) -> ObjectModels:
@@ -95,23 +100,13 @@ def load_models(folder: Path, count: int = 400) -> ObjectModels:
     points, surface, axes = [], [], np.zeros((len(ids), 3))
     for number in ids:
         vertices, faces = read_model_mesh(folder / f"obj_{number:06d}.ply")
-        surface.append(_spread_over(vertices, faces, 1000, np.random.default_rng(number)))
+        surface.append(blend(vertices, *spread_over(vertices, faces, 1000, np.random.default_rng(number))))
         points.append(vertices[np.linspace(0, len(vertices) - 1, count).astype(int)])
         symmetry = info[number].symmetry
         if symmetry is not None and symmetry.order == "continuous":
             axes[number - 1] = symmetry.axis
     diameters = np.array([info[number].diameter_m for number in ids])
     return ObjectModels(np.stack(points), np.stack(surface), diameters, axes)
-
-
-def _spread_over(vertices: Array, faces: NDArray[np.int32], count: int, rng: np.random.Generator) -> Array:
-    """Return count random points (count, 3) on the triangles, as many per area everywhere."""
-    a, b, c = (vertices[faces[:, k]] for k in range(3))
-    area = np.linalg.norm(np.cross(b - a, c - a), axis=1)
-    face = rng.choice(len(faces), count, p=area / area.sum())
-    share = np.sort(rng.random((count, 2)), axis=1)  # two cuts of a unit length give barycentric shares
-    shares = np.stack([share[:, 0], share[:, 1] - share[:, 0], 1 - share[:, 1]], -1)
-    return np.einsum("nk,nkj->nj", shares, np.stack([a[face], b[face], c[face]], 1))
 
 
 def pack_scene(scene: Path, out: Path) -> None:
@@ -188,7 +183,10 @@ NO_CHANGE = AugmentOptions(0.0, 0.0, 0.0, 0.0, 0.0)
 class PackedImages:
     """All packed scenes of a folder as one row of samples."""
 
-    def __init__(self, scenes: list[Path], models: ObjectModels, stride: int = 8, least_visible: float = 0.1) -> None:
+    def __init__(
+        self, scenes: list[Path], models: ObjectModels, stride: int | None = 8, least_visible: float = 0.1
+    ) -> None:
+        """stride: pixels per cell of the samples' object coordinates, None: they have none."""
         if not scenes:
             raise InputError("there is no packed scene to train on", fix="render and pack first")
         self.scenes = [open_packed(scene) for scene in scenes]
@@ -210,7 +208,10 @@ class PackedImages:
         poses, classes, visible = scene.poses[rows], scene.classes[rows], scene.visible[rows]
         warp = K_new @ R_turn @ np.linalg.inv(K)
         R_old, t_old = poses[:, :, :3], poses[:, :, 3]
-        surface = self._surface(scene, n, R_old, t_old, classes, K, np.linalg.inv(warp), (height, width))
+        surface = np.zeros((0, 0, 3))
+        if self.stride is not None:
+            cells = _cell_centres((height, width), self.stride) @ np.linalg.inv(warp).T
+            surface = self._surface(scene, n, R_old, t_old, classes, K, cells)
         if augment != NO_CHANGE:
             image = _shake_colors(
                 cv2.warpPerspective(image, warp, (width, height), borderMode=cv2.BORDER_REFLECT), rng, augment
@@ -223,8 +224,9 @@ class PackedImages:
         keep &= size.prod(1) > 0.2 * whole_size.prod(1)  # turned or shifted out of the image
         flat = np.array([K_new[0, 0], K_new[1, 1], K_new[0, 2], K_new[1, 2]])
         return Sample(
-            np.ascontiguousarray(image), flat, classes[keep], R[keep], t[keep], boxes[keep], visible[keep], surface
-        )
+            np.ascontiguousarray(image), flat, classes[keep], R[keep], t[keep], boxes[keep], visible[keep], surface,
+            np.arange(rows.start, rows.stop)[keep], R_turn,
+        )  # fmt: skip
 
     def _boxes(self, R: Array, t: Array, classes: NDArray[np.int64], K: Array) -> Array:
         points = self.models.points[classes - 1] @ R.mT + t[:, None]
@@ -233,13 +235,9 @@ class PackedImages:
         return np.stack([u.min(1), v.min(1), u.max(1), v.max(1)], -1) + 0.5  # from pixel centres to edges
 
     def _surface(
-        self, scene: PackedScene, n: int, R: Array, t: Array, classes: NDArray[np.int64], K: Array, unwarp: Array,
-        size: tuple[int, int],
-    ) -> Array:  # fmt: skip
-        """Object coordinates at the cell centres of the new image, looked up in the old one's depth."""
-        rows, columns = -(-size[0] // self.stride), -(-size[1] // self.stride)
-        v, u = np.mgrid[0:rows, 0:columns] * self.stride + (self.stride - 1) / 2
-        old = np.stack([u, v, np.ones_like(u)], -1) @ unwarp.T
+        self, scene: PackedScene, n: int, R: Array, t: Array, classes: NDArray[np.int64], K: Array, old: Array
+    ) -> Array:
+        """Object coordinates where the new image's cells (h, w, 3) are in the old one, from its depth."""
         x, y = (
             np.rint(old[..., 0] / old[..., 2] / SHRINK).astype(int),
             np.rint(old[..., 1] / old[..., 2] / SHRINK).astype(int),
@@ -248,7 +246,7 @@ class PackedImages:
         inside = (x >= 0) & (y >= 0) & (x < instance.shape[1]) & (y < instance.shape[0])
         x, y = np.where(inside, x, 0), np.where(inside, y, 0)
         row = np.where(inside, instance[y, x], 0).astype(int) - 1
-        surface = np.full((rows, columns, 3), np.nan)
+        surface = np.full(old.shape, np.nan)
         hit = row >= 0
         if hit.any():
             z = depth[y[hit], x[hit]] * 1e-4
@@ -259,6 +257,12 @@ class PackedImages:
             point = np.einsum("ni,nij->nj", ray * z[:, None] - t[row[hit]], turned[row[hit]])
             surface[hit] = point / self.models.diameters[classes[row[hit]] - 1, None]
         return surface
+
+
+def _cell_centres(size: tuple[int, int], stride: int) -> Array:
+    rows, columns = -(-size[0] // stride), -(-size[1] // stride)
+    v, u = np.mgrid[0:rows, 0:columns] * stride + (stride - 1) / 2
+    return np.stack([u, v, np.ones_like(u)], -1)
 
 
 def canonical_rotation(R: Array, t: Array, axes: Array) -> Array:

@@ -131,6 +131,8 @@ class Estimator:
         batch, features = self.features(pictures)
         queries = self.queries(pictures, batch, features)
         output = self.engine.poses(features, batch.mask, queries, batch.intrinsics)
+        with torch.autocast(self.device.type, torch.bfloat16, enabled=self.options.engine == "bfloat16"):
+            output = self.network.refined(batch, output)
         seconds = (time.perf_counter() - start) / len(pictures)
         return [self._sighting(picture, output, i, batch, seconds) for i, picture in enumerate(pictures)]
 
@@ -224,7 +226,9 @@ def _load(options: DetectOptions) -> tuple[PoET, ModelConfig]:
         network, config = load_model(options.weights)
         if config.detector is None:
             raise InputError("has no detector", path=options.weights, fix="convert a checkpoint that holds one")
-        return network, replace(config)
-    from poet_loc.model.embedded import load_embedded
+    else:
+        from poet_loc.model.embedded import load_embedded
 
-    return load_embedded()
+        network, config = load_embedded()
+    network.refine_in(options.rounds)
+    return network, config

@@ -21,6 +21,9 @@ class DetectOptions:
     """Exported pose network (.onnx or .xml) that is run instead; `weights` still has detector and configuration."""
     engine: Engine = "fast"
     """fast: fused path for CPUs; bfloat16: the same at half width, less exact; eager: plain torch, also on a GPU."""
+    rounds: int | None = None
+    """Rounds in which poses are compared with views of the models and corrected; 0: none, without it as many as the
+    weights were made for."""
     device: str = "cpu"
     """cpu or cuda; a GPU takes engine eager."""
     threads: int | None = None
@@ -53,4 +56,5 @@ class DetectOptions:
 
     def __post_init__(self) -> None:
         at_least(1, self, "batch", *([] if self.threads is None else ["threads"]))
+        at_least(0, self, *([] if self.rounds is None else ["rounds"]))
         at_least(1e-6, self, "rate")

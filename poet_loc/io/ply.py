@@ -43,14 +43,50 @@ class _Element:
 
 def read_model_points(path: str | Path) -> Array:
     """Return the vertices (V, 3) of a BOP model in m.  Raises InputError for what is no such file."""
-    return read_model_mesh(path, with_faces=False)[0]
+    return _points(_read(path, with_faces=False)[0])
 
 
-def read_model_mesh(path: str | Path, with_faces: bool = True) -> tuple[Array, Triangles]:
+def read_model_mesh(path: str | Path) -> tuple[Array, Triangles]:
     """Return vertices (V, 3) in m and triangles (F, 3) of a BOP model; polygons are cut into fans.
 
     Raises InputError for what is no such file, and for faces that differ in their number of corners.
     """
+    vertices, triangles, _ = _read(path)
+    return _points(vertices), triangles
+
+
+@dataclass(frozen=True)
+class ColouredMesh:
+    """A model with what it looks like; at most one of the two is known."""
+
+    vertices: Array
+    """(V, 3) m."""
+    triangles: Triangles
+    """(F, 3)"""
+    colours: NDArray[np.uint8] | None
+    """(V, 3) RGB."""
+    texture: Path | None
+    """Image file."""
+    texture_places: Array | None
+    """(V, 2) in shares of the image's width and height, from its lower left corner."""
+
+
+def read_coloured_mesh(path: str | Path) -> ColouredMesh:
+    """Return a BOP model with its texture's places or its vertices' colours.  Raises InputError as read_model_mesh."""
+    vertices, triangles, header = _read(path)
+    names = vertices.dtype.names or ()
+    file = next((line.split(maxsplit=2)[2].strip() for line in header if line.startswith("comment TextureFile")), None)
+    if file is not None and {"texture_u", "texture_v"} <= set(names):
+        places = np.stack([vertices[axis] for axis in ("texture_u", "texture_v")], -1).astype(float)
+        return ColouredMesh(_points(vertices), triangles, None, Path(path).parent / file, places)
+    colours = None
+    if {"red", "green", "blue"} <= set(names):
+        colours = np.stack([vertices[name] for name in ("red", "green", "blue")], -1).astype(np.uint8)
+    return ColouredMesh(_points(vertices), triangles, colours, None, None)
+
+
+def _read(path: str | Path, with_faces: bool = True) -> tuple[NDArray[np.void], Triangles, list[str]]:
+    """Return the rows of vertices, the triangles, and the lines of the header."""
     try:
         data = Path(path).read_bytes()
     except FileNotFoundError:
@@ -66,14 +102,18 @@ def read_model_mesh(path: str | Path, with_faces: bool = True) -> tuple[Array, T
             raise ValueError("the vertices do not come first")
         body = body[body.index(b"\n") + 1 :]
         vertices, body = _read_element(body, elements[0], order)
-        points = np.stack([vertices[axis] for axis in "xyz"], axis=-1).astype(float) / _MM_PER_M
+        _points(vertices)
         if not with_faces:
-            return points, np.zeros((0, 3), np.int32)
+            return vertices, np.zeros((0, 3), np.int32), lines
         if len(elements) < 2 or elements[1].name != "face" or elements[1].count == 0:
             raise ValueError("it has no faces")
-        return points, _triangles(_read_element(body, elements[1], order)[0], len(points))
+        return vertices, _triangles(_read_element(body, elements[1], order)[0], len(vertices)), lines
     except (ValueError, KeyError, StopIteration, IndexError) as error:
         raise InputError(f"not a PLY model ({error})", path=path) from None
+
+
+def _points(vertices: NDArray[np.void]) -> Array:
+    return np.stack([vertices[axis] for axis in "xyz"], axis=-1).astype(float) / _MM_PER_M
 
 
 def _elements(lines: list[str]) -> list[_Element]:

@@ -16,6 +16,7 @@ from poet_loc.core.input_error import InputError
 from poet_loc.model.detectors import build_detector, kind_of, options_of_kind, record_from, record_to_dict
 from poet_loc.model.options import NetworkOptions
 from poet_loc.model.poet import PoET
+from poet_loc.model.refiner import PoseRefiner, RefinerOptions
 
 FORMAT = "poet-loc network 1"
 
@@ -37,6 +38,8 @@ class ModelConfig:
     """fx, fy, cx, cy (px) of the training images."""
     variance_scale: tuple[float, float] = (1.0, 1.0)
     """Factors on the translation's and the rotation's variances, found on held-out data."""
+    refiner: RefinerOptions | None = None
+    """What corrects the poses by comparing them with the models; None: nothing does."""
     source: dict[str, Any] = field(default_factory=dict)
     """Where the weights come from, for the record."""
 
@@ -49,6 +52,8 @@ class ModelConfig:
         values = record_to_dict(replace(self, detector=None))
         if self.detector is not None:
             values["detector"] = {"kind": kind_of(self.detector), **record_to_dict(self.detector)}
+        if self.refiner is None:
+            del values["refiner"]
         return values
 
     @classmethod
@@ -60,7 +65,10 @@ class ModelConfig:
         if detector is not None:
             detector = dict(detector)
             detector = options_of_kind(detector.pop("kind", ""), detector)
-        config: ModelConfig = record_from(cls, given | {"network": network, "detector": detector})
+        refiner = given.pop("refiner", None)
+        refiner = None if refiner is None else record_from(RefinerOptions, dict(refiner))
+        parts = {"network": network, "detector": detector, "refiner": refiner}
+        config: ModelConfig = record_from(cls, given | parts)
         return config
 
 
@@ -147,10 +155,15 @@ def load_model(path: str | Path, with_detector: bool = True) -> tuple[PoET, Mode
     weights, config = read_weights(path)
     if not with_detector:
         weights = {name: tensor for name, tensor in weights.items() if not name.startswith("backbone.0.")}
-    detector = build_detector(config.detector) if with_detector and config.detector is not None else None
-    network = PoET(config.network, detector)
+    network = build_network(config, with_detector)
     load_strictly(network, weights, path)
     return network.eval(), config
+
+
+def build_network(config: ModelConfig, with_detector: bool = True) -> PoET:
+    """Return the network of a configuration, its weights at random."""
+    detector = build_detector(config.detector) if with_detector and config.detector is not None else None
+    return PoET(config.network, detector, None if config.refiner is None else PoseRefiner(config.refiner))
 
 
 def load_strictly(network: torch.nn.Module, weights: Mapping[str, Tensor], path: str | Path) -> None:

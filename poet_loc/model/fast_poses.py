@@ -181,7 +181,7 @@ class FastPoses:
         features = self.network.extract(batch)
         if queries is None:
             queries = self.network.detected_queries(features)
-        return self.poses(features, batch.mask, queries, batch.intrinsics)
+        return self.network.refined(batch, self.poses(features, batch.mask, queries, batch.intrinsics))
 
     @torch.inference_mode()
     def poses(

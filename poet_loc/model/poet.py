@@ -10,10 +10,11 @@ from torch import Tensor, nn
 
 from poet_loc.core.input_error import InputError
 from poet_loc.model.backbone import Backbone, Features, ImageBatch, mask_of_level
-from poet_loc.model.heads import heads_per_layer, pick_class, rotation_from_6d
+from poet_loc.model.heads import heads_per_layer, pick_class, rotation_from_6d, rotation_matrices
 from poet_loc.model.options import NetworkOptions
 from poet_loc.model.position_encoding import LearnedPositionEncoding, SinePositionEncoding, box_code
 from poet_loc.model.queries import DUMMY_CODE, QueryBoxes, queries_from_detections, real_queries
+from poet_loc.model.refiner import Estimates, PoseRefiner
 from poet_loc.model.transformer import DeformableTransformer, Tokens
 
 
@@ -54,9 +55,12 @@ class PoET(nn.Module):
     The state dict has the official names; `backbone.0` is the detector, `backbone.1` the position encoding.
     """
 
-    def __init__(self, options: NetworkOptions, detector: Backbone | None = None) -> None:
+    def __init__(
+        self, options: NetworkOptions, detector: Backbone | None = None, refiner: PoseRefiner | None = None
+    ) -> None:
         super().__init__()
         self.options = options
+        self.refiner = refiner
         dim = options.hidden_dim
         encoding = SinePositionEncoding if options.position_encoding == "sine" else LearnedPositionEncoding
         if detector is not None:
@@ -100,7 +104,33 @@ class PoET(nn.Module):
         if queries is None:
             with torch.no_grad():
                 queries = self.detected_queries(features)
-        return self.poses(features, batch.mask, queries, batch.intrinsics)
+        output = self.poses(features, batch.mask, queries, batch.intrinsics)
+        return output if self.training else self.refined(batch, output)
+
+    def refined(self, batch: ImageBatch, output: PoseOutput) -> PoseOutput:
+        """Return the poses after the refiner's rounds of comparing them with the images; without one as they are."""
+        if self.refiner is None:
+            return output
+        if batch.intrinsics is None:
+            raise ValueError("a refiner needs intrinsics")
+        real = real_queries(output.queries)
+        rotation = rotation_matrices(output.rotation).clone()
+        start = Estimates(
+            torch.nonzero(real)[:, 0], output.queries.classes[real], output.translation[real], rotation[real]
+        )
+        end = self.refiner(batch.images, batch.intrinsics, start)
+        translation, log_variance = output.translation.clone(), torch.zeros(*real.shape, 6, device=real.device)
+        translation[real], rotation[real], log_variance[real] = end.translation, end.rotation, end.log_variance
+        return PoseOutput(translation, rotation, output.queries, log_variance[..., :3], log_variance[..., 3:])
+
+    def refine_in(self, rounds: int | None) -> None:
+        """Set the refiner's rounds; 0: no refiner, None: as it was made.  Raises InputError where there is none."""
+        if rounds == 0:
+            self.refiner = None
+        elif rounds is not None:
+            if self.refiner is None:
+                raise InputError("this network has no refiner", fix="leave out --rounds")
+            self.refiner.options = replace(self.refiner.options, rounds=rounds)
 
     def extract(self, batch: ImageBatch) -> Features:
         """Return the detector's feature maps; without gradients unless the detector has trainable parameters."""

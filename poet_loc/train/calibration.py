@@ -30,10 +30,13 @@ def coverage(error: Array, log_variance: Array) -> Array:
 
 @torch.no_grad()
 def scale_sigmas(network: PoET, factors: Array) -> None:
-    """Multiply the sigmas of the last decoder layer by (6,) factors, translation first, in the heads' biases.
+    """Multiply the sigmas of the refiner, else of the last decoder layer, by (6,) factors, translation first.
 
-    Raises ValueError for a network without aleatoric heads.
+    The factors go into the biases.  Raises ValueError for a network without aleatoric heads.
     """
+    if network.refiner is not None:
+        network.refiner.get_parameter("spread.2.bias").add_(torch.from_numpy(2.0 * np.log(factors)).float())
+        return
     if network.options.uncertainty != "aleatoric":
         raise ValueError(f"uncertainty {network.options.uncertainty} has no log variances to scale")
     shift = torch.from_numpy(2.0 * np.log(factors)).float()

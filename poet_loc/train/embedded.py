@@ -267,7 +267,7 @@ def predict(
             queries = queries_from_detections(module.detector.detect(features), batch.size, limit)
             image, query, found = _answers(queries, samples)
             truth = truth.rows(found)
-        output = module.poses(features, batch.mask, queries, batch.intrinsics)
+        output = module.refined(batch, module.poses(features, batch.mask, queries, batch.intrinsics))
         parts = (output.translation_uncertainty, output.rotation_uncertainty)
         known = [part[image, query] for part in parts if part is not None]
         s = torch.cat(known, 1) if len(known) == 2 else torch.zeros(len(truth.t), 6)

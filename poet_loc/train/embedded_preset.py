@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 import torch
@@ -17,10 +18,14 @@ from poet_loc.model.small_detector import SmallDetector, SmallDetectorOptions
 from poet_loc.train.calibration import coverage, scale_sigmas, temperatures
 from poet_loc.train.detector import TrainDetectorOptions, train_detector
 from poet_loc.train.embedded import EMBEDDED, Boxes, TrainEmbeddedOptions, pose_errors, predict, train_embedded
+from poet_loc.train.optimizer import OptimizerKind
+from poet_loc.train.refiner import TrainRefinerOptions, train_refiner
 from poet_loc.train.steps import StepOptions
 
 Array = NDArray[np.float64]
 BOXES: tuple[Boxes, ...] = ("bb", "gt")
+Stage = Literal["detector", "joint", "refiner"]
+STAGES: tuple[Stage, ...] = ("detector", "joint", "refiner")
 
 
 @dataclass(frozen=True)
@@ -35,8 +40,10 @@ class EmbeddedPresetOptions:
     """Rendered validation images, of other scenes."""
     detector_steps: int = 700
     """Steps of the detector alone, before the pose network joins."""
-    joint_steps: int = 12000
+    joint_steps: int = 15500
     """Steps of detector and pose network together."""
+    refiner_steps: int = 4000
+    """Steps of the refiner, once the pose network has done all of its own."""
     batch: int = 16
     """Images per step."""
     seed: int = 0
@@ -59,35 +66,53 @@ def train_preset(options: EmbeddedPresetOptions) -> Path:
     shared = {"out": world, "seed": options.seed, "jobs": options.jobs}
     render(RenderOptions(split="val", images=options.val_images, first_scene=900_000, **shared))  # type: ignore[arg-type]
     render(RenderOptions(split="train", images=options.train_images, **shared))  # type: ignore[arg-type]
-    first = _steps(options, "detector", options.detector_steps, 1e-3)
-    train_detector(TrainDetectorOptions(world, cache, first))
+    train_detector(TrainDetectorOptions(world, cache, _steps(options, "detector")))
     detector = SmallDetector(SmallDetectorOptions())
     detector.load_state_dict(torch.load(options.out / "detector" / "checkpoint.pt", weights_only=True)["module"])
-    steps = replace(_steps(options, "joint", options.joint_steps, 7e-4), optimizer="muon")
-    network = train_embedded(TrainEmbeddedOptions(world, cache, steps, fine_tune=True), detector)
+    network = train_embedded(TrainEmbeddedOptions(world, cache, _steps(options, "joint"), fine_tune=True), detector)
+    if _done(options.out / "joint") >= options.joint_steps:
+        refiner = train_refiner(TrainRefinerOptions(world, cache, _steps(options, "refiner")), network)
+        if _done(options.out / "refiner") >= options.refiner_steps:
+            network.refiner = refiner
     return finish(network, world, cache, options.out / "embedded.safetensors", history(options.out))
 
 
-def _steps(options: EmbeddedPresetOptions, stage: str, count: int, rate: float) -> StepOptions:
+def _steps(options: EmbeddedPresetOptions, stage: Stage) -> StepOptions:
+    stages: dict[Stage, tuple[int, float, OptimizerKind]] = {
+        "detector": (options.detector_steps, 1e-3, "adamw"),
+        "joint": (options.joint_steps, 7e-4, "muon"),
+        "refiner": (options.refiner_steps, 1.5e-3, "muon"),
+    }
+    count, rate, kind = stages[stage]
     return StepOptions(
         options.out / stage,
         steps=count,
         batch=options.batch,
         learning_rate=rate,
+        optimizer=kind,
         precision=options.precision,
         seed=options.seed,
         max_steps=options.max_steps,
     )
 
 
+def _done(stage: Path) -> float:
+    return _last_row(stage).get("step", 0.0)
+
+
+def _last_row(stage: Path) -> dict[str, float]:
+    path = stage / "log.jsonl"
+    rows = path.read_text().splitlines() if path.exists() else []
+    return dict(json.loads(rows[-1])) if rows else {}
+
+
 def history(folder: Path) -> dict[str, object]:
     """Return what a run's logs say about its length, for the record in the checkpoint."""
-    last = {}
-    for stage in ("detector", "joint"):
-        path = folder / stage / "log.jsonl"
-        rows = [json.loads(line) for line in path.read_text().splitlines()] if path.exists() else []
-        last[stage] = {key: rows[-1][key] for key in ("step", "cpu_minutes")} if rows else {}
-    return {"preset": "embedded", **last}
+    last = {stage: _last_row(folder / stage) for stage in STAGES}
+    told: dict[str, object] = {
+        stage: {key: row[key] for key in ("step", "cpu_minutes")} for stage, row in last.items() if row
+    }
+    return {"preset": "embedded", **told}
 
 
 def finish(network: PoET, world: Path, cache: Path, out: Path, source: dict[str, object]) -> Path:
@@ -109,6 +134,7 @@ def finish(network: PoET, world: Path, cache: Path, out: Path, source: dict[str,
         ids,
         tuple(names[str(number)] for number in ids),
         image_size=(320, 240),
+        refiner=None if network.refiner is None else network.refiner.options,
         source={
             **source,
             "images": len(val),

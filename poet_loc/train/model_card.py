@@ -36,6 +36,8 @@ class MeasureOptions:
     """Checkpoint (safetensors); without it the embedded one."""
     write_poses: bool = True
     """Write object_poses_bb.csv and object_poses_gt.csv into the videos' folders, objects of the map alone."""
+    rounds: int | None = None
+    """Rounds of the refiner; 0: none, without it as many as the weights were made for."""
     least_visible: float = 0.1
     """Objects less visible than this share are not asked for."""
     jobs: int = 1
@@ -113,15 +115,17 @@ def _poses_of_videos(options: MeasureOptions, folders: Sequence[Path]) -> Iterat
     from poet_loc.data.render import progress_bar
 
     workers = Parallel(n_jobs=options.jobs, return_as="generator")
-    found = workers(delayed(_poses_of)(options.weights, folder) for folder in folders)
+    found = workers(delayed(_poses_of)(options.weights, options.rounds, folder) for folder in folders)
     with progress_bar("measuring", "videos", len(folders), options.progress) as advance:
         for folder, poses in zip(folders, found, strict=True):
             yield folder, poses
             advance(1)
 
 
-def _poses_of(weights: Path, folder: Path) -> VideoPoses:
-    return poses_of_video(*load_model(weights), folder)
+def _poses_of(weights: Path, rounds: int | None, folder: Path) -> VideoPoses:
+    network, config = load_model(weights)
+    network.refine_in(rounds)
+    return poses_of_video(network, config, folder)
 
 
 def _boxes_with_class(scene: BopScene, row: int, least_visible: float) -> Array:
@@ -234,9 +238,8 @@ def full_card(options: MeasureOptions, figures: Figures, log: Path) -> str:
     lines = [
         "# Model card: embedded",
         "",
-        "Small detector and PoET for the ten rendered household objects (ids 1..10: "
-        + ", ".join(config.object_names)
-        + "), weights in float16.",
+        f"Small detector, PoET{'' if config.refiner is None else ' and refiner'} for the ten rendered household objects "
+        f"(ids 1..10: {', '.join(config.object_names)}), weights in float16.",
         "",
         f"- Trained from scratch by `poet-loc train --preset embedded`: {stages}.",
         f"- Seeds: data 0, weights 0. {source.get('data', '')}".rstrip(),

@@ -8,7 +8,7 @@ from typing import Any
 
 from poet_loc.core.input_error import InputError
 from poet_loc.model.backbone import Backbone
-from poet_loc.model.checkpoint import ModelConfig, load_strictly, read_weights
+from poet_loc.model.checkpoint import ModelConfig, build_network, load_strictly, read_weights
 from poet_loc.model.detectors import build_detector, options_of_kind
 from poet_loc.model.official_checkpoint import read_detector_weights
 from poet_loc.model.poet import PoET
@@ -40,7 +40,11 @@ def _from_file(options: TrainOptions, path: Path, object_ids: tuple[int, ...]) -
         network_options = replace(network_options, uncertainty=options.uncertainty)
     if config.detector is None:
         raise InputError("has no detector to train on", path=path)
-    network = PoET(network_options, build_detector(config.detector))
+    refiner = config.refiner if object_ids == config.object_ids else None  # its models are of other objects
+    if refiner is None:
+        weights = {name: w for name, w in weights.items() if not name.startswith("refiner.")}
+    config = replace(config, network=network_options, object_ids=object_ids, refiner=refiner)
+    network = build_network(config)
     wanted = network.state_dict()
     unfit = [
         name
@@ -50,7 +54,7 @@ def _from_file(options: TrainOptions, path: Path, object_ids: tuple[int, ...]) -
     gone = [name for name in weights if name.startswith(REPLACEABLE) and name not in wanted]
     kept = {name: w for name, w in weights.items() if name not in unfit and name not in gone}
     load_strictly(network, {**kept, **{name: wanted[name] for name in unfit}}, path)
-    return network, replace(config, network=network_options, object_ids=object_ids), unfit
+    return network, config, unfit
 
 
 def _detector(options: TrainOptions) -> tuple[Backbone, Any]:

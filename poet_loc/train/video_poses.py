@@ -49,6 +49,8 @@ def poses_of_video(network: PoET, config: ModelConfig, folder: Path, batch: int 
             for kind, each in boxes.items():
                 queries = queries_from_detections(each, images.size, network.options.queries)
                 output = network.poses(features, images.mask, queries, images.intrinsics)
+                with torch.autocast("cpu", torch.bfloat16, enabled=low_precision("auto")):
+                    output = network.refined(images, output)
                 parts[kind].append(object_poses(output, config, frames.stamps_ns[rows], frames.frames[rows]))
     return VideoPoses({kind: join(rows) for kind, rows in parts.items()}, detections)
 

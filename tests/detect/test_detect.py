@@ -33,6 +33,7 @@ from poet_loc.model.detectors import options_of_kind
 from poet_loc.model.heads import covariance_matrices
 from poet_loc.model.options import PUBLISHED
 from poet_loc.model.poet import PoET
+from poet_loc.model.refiner import PoseRefiner, RefinerOptions
 from poet_loc.model.yolov4 import YoloOptions, YoloV4Csp
 
 CAMERA = (FOCAL, FOCAL, SIZE[0] / 2, SIZE[1] / 2)
@@ -101,6 +102,30 @@ def test_files_of_a_run(images: Path, boxes: Path, tmp_path: Path) -> None:
     assert json.loads((out / "summary.json").read_text())["images"] == 4
     overlay = read_image(out / "overlays" / "000001.png")
     assert (overlay != read_image(images / "000001.png")).any()
+
+
+def test_rounds_of_the_refiner_are_an_option(images: Path, boxes: Path, tmp_path: Path) -> None:
+    network, config = tiny_network()
+    torch.nn.init.normal_((refiner := PoseRefiner(RefinerOptions(3, points=30, widths=(8, 8, 8)))).flow.weight)
+    refiner.show(torch.rand(3, 30, 3) - 0.5, torch.zeros(3, 30, 3), torch.ones(3))
+    network.refiner = refiner
+    save_model(tmp_path / "with.safetensors", network, replace(config, refiner=refiner.options))
+    network.refiner = None
+    save_model(tmp_path / "without.safetensors", network, config)
+
+    def found(name: str, rounds: int | None):
+        options = DetectOptions(tmp_path / f"{name}.safetensors", boxes=boxes, intrinsics=CAMERA, rounds=rounds)
+        return read_object_poses(detect(images, tmp_path / f"{name}_{rounds}", options) / "object_poses.csv")
+
+    plain, none, one, made = found("without", None), found("with", 0), found("with", 1), found("with", None)
+    assert np.array_equal(plain.T_cam_obj.as_matrix(), none.T_cam_obj.as_matrix())
+    assert np.array_equal(found("with", 3).T_cam_obj.as_matrix(), made.T_cam_obj.as_matrix())
+    differ = [np.abs(each.T_cam_obj.translation - plain.T_cam_obj.translation).max() for each in (one, made)]
+    assert min(differ) > 1e-4
+    with pytest.raises(InputError, match="no refiner"):
+        found("without", 2)
+    with pytest.raises(InputError, match="rounds is -1"):
+        DetectOptions(rounds=-1)
 
 
 def test_the_boxes_of_a_run_give_the_same_poses_again(images: Path, boxes: Path, tmp_path: Path) -> None:

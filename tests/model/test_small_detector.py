@@ -44,6 +44,7 @@ def sample_with(boxes: np.ndarray, classes: list[int]) -> Sample:
     return Sample(
         np.zeros((96, 128, 3), np.uint8), np.array([100.0, 100, 64, 48]), np.array(classes),
         np.tile(np.eye(3), (count, 1, 1)), np.tile([0, 0, 1.0], (count, 1)), boxes, np.ones(count), surface,
+        np.arange(count), np.eye(3),
     )  # fmt: skip
 
 

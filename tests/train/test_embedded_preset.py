@@ -15,18 +15,25 @@ from poet_loc.train.model_card import MeasureOptions, card_table, full_card, mea
 from poet_loc.videos import VideoOptions, render_videos
 
 
+def miniature(out) -> EmbeddedPresetOptions:
+    steps = {"detector_steps": 1, "joint_steps": 2, "refiner_steps": 1}
+    return EmbeddedPresetOptions(out, 4, 4, **steps, batch=2, jobs=1, precision="float32")
+
+
 @pytest.fixture(scope="module")
 def checkpoint(tmp_path_factory):
     out = tmp_path_factory.mktemp("preset")
-    options = EmbeddedPresetOptions(out, 4, 4, detector_steps=1, joint_steps=1, batch=2, jobs=1, precision="float32")
-    return train_preset(options)
+    return train_preset(miniature(out))
 
 
 def test_the_checkpoint_holds_detector_network_names_and_its_history(checkpoint):
     network, config = load_model(checkpoint)
     assert network.options == config.network == EMBEDDED
     assert config.object_names[8] == "bowl"
-    assert config.source["joint"]["step"] == 1
+    assert config.source["joint"]["step"] == 2
+    assert config.source["refiner"]["step"] == 1
+    assert network.refiner is not None
+    assert network.refiner.options == config.refiner
     assert len(config.source["temperatures"]) == 6
     assert config.source["calibrated_for"] == "gt"  # after two steps the detector finds nothing
     assert all(0.4 < share < 0.9 for share in config.source["coverage"]["gt"])
@@ -40,8 +47,15 @@ def test_a_second_call_finds_everything_done(checkpoint, monkeypatch):
         raise AssertionError("nothing is left to train")
 
     monkeypatch.setattr(steps.torch.optim.AdamW, "step", fail)
-    options = EmbeddedPresetOptions(checkpoint.parent, 4, 4, detector_steps=1, joint_steps=1, batch=2, jobs=1)
-    assert train_preset(replace(options, precision="float32")) == checkpoint
+    assert train_preset(miniature(checkpoint.parent)) == checkpoint
+
+
+def test_a_network_that_is_not_through_gets_no_refiner(checkpoint, tmp_path):
+    for name in ("world", "packed", "detector"):
+        (tmp_path / name).symlink_to(checkpoint.parent / name)
+    network, config = load_model(train_preset(replace(miniature(tmp_path), max_steps=1)))
+    assert network.refiner is config.refiner is None
+    assert not (tmp_path / "refiner").exists()
 
 
 def test_the_card_counts_every_object_that_was_asked_for(checkpoint, tmp_path):
@@ -51,7 +65,8 @@ def test_the_card_counts_every_object_that_was_asked_for(checkpoint, tmp_path):
     assert len(gt.object_ids) == len(figures.scores["bb"].object_ids) > 0
     assert (gt.translation_m < 10).all()
     card = full_card(MeasureOptions(tmp_path, checkpoint), figures, checkpoint.parent / "joint" / "log.jsonl")
-    assert "joint 1 steps" in card
+    assert "joint 2 steps" in card
+    assert "refiner 1 steps" in card
     assert "Within one sigma there, gt boxes" in card
     table = card_table(figures)
     assert table in card
