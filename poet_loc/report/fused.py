@@ -58,12 +58,8 @@ class Calibrated(Protocol):
         """The map as it was found; None where it was taken as given."""
 
 
-class Fused(Protocol):
-    """A fused trajectory: the state and its 1-sigma at N stamps."""
-
-    @property
-    def name(self) -> str:
-        """`fuse/<estimator>/<measurements>`"""
+class HasStates(Protocol):
+    """What states.csv holds of a fused result, at N stamps."""
 
     @property
     def stamps_ns(self) -> Stamps:
@@ -88,6 +84,14 @@ class Fused(Protocol):
     @property
     def sigmas(self) -> Array:
         """(N, 15) 1-sigma in the order of STATE_AXES: attitude (imu axes, rad), position, velocity, biases; SI"""
+
+
+class Fused(HasStates, Protocol):
+    """A fused trajectory: the state and its 1-sigma at N stamps."""
+
+    @property
+    def name(self) -> str:
+        """`fuse/<estimator>/<measurements>`"""
 
     @property
     def pose_covariances(self) -> Array | None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 import yaml
@@ -17,7 +17,7 @@ from poet_loc.core.trajectory import Trajectory
 from poet_loc.io.input_text import first_line, read_text
 from poet_loc.io.number_table import read_number_csv, write_csv
 from poet_loc.io.tum import read_tum
-from poet_loc.report.fused import STATE_AXES
+from poet_loc.report.fused import STATE_AXES, HasStates
 from poet_loc.report.summary import Summary, read_summary
 
 Array = NDArray[np.float64]
@@ -28,34 +28,6 @@ _GYROSCOPE, _ACCELEROMETER = ("bgx", "bgy", "bgz"), ("bax", "bay", "baz")
 _SIGMAS = tuple(f"sigma_{axis}" for axis in STATE_AXES)
 STATE_COLUMNS = (*_POSITION, *_VELOCITY, *_QUATERNION, *_GYROSCOPE, *_ACCELEROMETER, *_SIGMAS)
 """Of states.csv, after timestamp_ns: m, m/s, q_xyzw, rad/s, m/s^2 and the 1-sigma of each, attitude in rad."""
-
-
-class HasStates(Protocol):
-    """What states.csv holds of a fused result."""
-
-    @property
-    def stamps_ns(self) -> Stamps:
-        """(N,)"""
-
-    @property
-    def T_world_imu(self) -> RigidTransform:
-        """N poses"""
-
-    @property
-    def velocity(self) -> Array:
-        """(N, 3) m/s, world axes"""
-
-    @property
-    def gyroscope_bias(self) -> Array:
-        """(N, 3) rad/s"""
-
-    @property
-    def accelerometer_bias(self) -> Array:
-        """(N, 3) m/s^2"""
-
-    @property
-    def sigmas(self) -> Array:
-        """(N, 15) in the order of STATE_AXES"""
 
 
 @dataclass(frozen=True)
