@@ -238,8 +238,8 @@ def full_card(options: MeasureOptions, figures: Figures, log: Path) -> str:
     lines = [
         "# Model card: embedded",
         "",
-        f"Small detector, PoET{'' if config.refiner is None else ' and refiner'} for the ten rendered household objects "
-        f"(ids 1..10: {', '.join(config.object_names)}), weights in float16.",
+        f"{'Small detector and PoET' if config.refiner is None else 'Small detector, PoET and refiner'} for the ten "
+        f"rendered household objects (ids 1..10: {', '.join(config.object_names)}), weights in float16.",
         "",
         f"- Trained from scratch by `poet-loc train --preset embedded`: {stages}.",
         f"- Seeds: data 0, weights 0. {source.get('data', '')}".rstrip(),
