@@ -32,7 +32,6 @@ from fusion.nav_state import (
     AT_EXTRINSICS,
     AT_OBJECTS,
     AT_TIME_OFFSET,
-    BIASES,
     CLONE,
     EXTRINSIC_POSITION,
     EXTRINSIC_ROTATION,
@@ -42,18 +41,25 @@ from fusion.nav_state import (
     OBJECTS,
     POSITION,
     POSITION_ERROR,
-    SPREAD_SIZE,
-    SPREADS,
     TIME_OFFSET,
     VELOCITY,
     VELOCITY_ERROR,
     Ints,
 )
+from fusion.object_rows import (
+    bias_position_rows,
+    put,
+    sum_biases,
+    transposed_times_skew,
+    write_bias_columns,
+    write_object_residual,
+    write_position_rows,
+    write_rotation_rows,
+)
 from fusion.so3_kernels import (
     apply,
     apply_transposed,
     exp_so3,
-    left_jacobian,
     left_jacobian_inverse,
     log_so3,
     multiply,
@@ -259,12 +265,12 @@ def _camera_pose(
         H[3 + i, 3 + i] = 1.0
     left_jacobian_inverse(residual[0], residual[1], residual[2], 1.0, inverse)
     multiply_transposed_right(inverse, R_ic, block)
-    _put(H, 0, 0, 1.0, block)
+    put(H, 0, 0, 1.0, block)
     times_skew(R_wi, p_ic[0], p_ic[1], p_ic[2], block)
-    _put(H, 3, 0, -1.0, block)
+    put(H, 3, 0, -1.0, block)
     if layout[AT_EXTRINSICS] >= 0:
-        _put(H, 0, 6, 1.0, inverse)
-        _put(H, 3, 9, 1.0, R_wi)
+        put(H, 0, 6, 1.0, inverse)
+        put(H, 3, 9, 1.0, R_wi)
 
 
 @njit(cache=True)
@@ -291,18 +297,18 @@ def _odometry_step(
         residual[3 + i] = t_m[i] - t[i]
     left_jacobian_inverse(residual[0], residual[1], residual[2], 1.0, inverse)
     multiply_transposed_right(inverse, R_ic, block)
-    _put(H, 0, 0, 1.0, block)
+    put(H, 0, 0, 1.0, block)
     multiply_transposed_right(inverse, R_wc, block)
-    _put(H, 0, at_clone, -1.0, block)
-    _transposed_times_skew(C, s, block)
-    _put(H, 3, at_clone, 1.0, block)
+    put(H, 0, at_clone, -1.0, block)
+    transposed_times_skew(C, s, block)
+    put(H, 3, at_clone, 1.0, block)
     for i in range(3):
         for j in range(3):
             H[3 + i, 3 + j] = C[3 * j + i]
             H[3 + i, at_clone + 3 + j] = -C[3 * j + i]
     multiply_transposed_left(C, x[0:9], R_wc)
     times_skew(R_wc, p_ic[0], p_ic[1], p_ic[2], block)
-    _put(H, 3, 0, -1.0, block)
+    put(H, 3, 0, -1.0, block)
     if layout[AT_EXTRINSICS] >= 0:
         multiply_transposed_right(inverse, R_tc, block)
         for i in range(3):
@@ -328,87 +334,20 @@ def _object_pose(
     H: Array,
     work: Array,
 ) -> None:
+    """Write residual and Jacobian of an object's pose in the camera; p_io, p_co is the object from IMU and camera."""
     R_ic, p_ic = x[EXTRINSIC_ROTATION : EXTRINSIC_ROTATION + 9], x[EXTRINSIC_POSITION : EXTRINSIC_POSITION + 3]
-    at = OBJECTS + OBJECT_SIZE * k
-    R_wo = x[at : at + 9]
-    R_co, biased, scratch, block = work[0:9], work[9:18], work[18:27], work[27:36]
-    p_io, p_co, axes, inverse = work[36:39], work[39:42], work[42:51], work[51:60]
-    jacobian = work[60:69]
-    multiply_transposed_left(R_wc, R_wo, R_co)
+    at, at_object = OBJECTS + OBJECT_SIZE * k, 12 if layout[AT_EXTRINSICS] >= 0 else 6
+    R_co, p_io, p_co, axes = work[0:9], work[36:39], work[39:42], work[42:51]
+    inverse, bias, spread = work[51:60], work[60:66], work[66:69]
+    multiply_transposed_left(R_wc, x[at : at + 9], R_co)
     apply_transposed(R_wi, x[at + 9] - p_wi[0], x[at + 10] - p_wi[1], x[at + 11] - p_wi[2], p_io)
     apply_transposed(R_ic, p_io[0] - p_ic[0], p_io[1] - p_ic[1], p_io[2] - p_ic[2], p_co)
-    b0 = b1 = b2 = c0 = c1 = c2 = 0.0
-    for bias in range(layout[N_BIAS_KINDS]):
-        b = layout[BIASES] + 6 * (k + bias * layout[N_OBJECTS])
-        b0, b1, b2 = b0 + x[b], b1 + x[b + 1], b2 + x[b + 2]
-        c0, c1, c2 = c0 + x[b + 3], c1 + x[b + 4], c2 + x[b + 5]
     write_bias_axes(p_co, axes)
-    turning = across = along = 1.0
-    if layout[N_BIAS_KINDS] > 0:
-        spread = layout[SPREADS] + SPREAD_SIZE * k
-        turning, across, along = x[spread], x[spread + 1], x[spread + 2]
-    b0, b1, b2 = turning * b0, turning * b1, turning * b2
-    c0, c1, c2 = across * c0, across * c1, along * c2
-    exp_so3(b0, b1, b2, scratch)
-    multiply(scratch, R_co, biased)
-    multiply_transposed_right(R_m, biased, block)
-    log_so3(block, residual)
-    for i in range(3):
-        residual[3 + i] = t_m[i] - p_co[i] - (axes[3 * i] * c0 + axes[3 * i + 1] * c1 + axes[3 * i + 2] * c2)
-    # Rotation rows: r(x (+) d) = Log(Exp(r) Exp(-Exp(b) delta)) with delta = -phi - R_ic^T theta + R_co omega.
+    sum_biases(x, k, layout, bias, spread)
+    write_object_residual(R_m, t_m, R_co, p_co, axes, bias, residual, work)
     left_jacobian_inverse(residual[0], residual[1], residual[2], -1.0, inverse)
-    multiply(inverse, scratch, block)
-    if layout[AT_EXTRINSICS] >= 0:
-        _put(H, 0, 6, -1.0, block)
-    multiply_transposed_right(block, R_ic, scratch)
-    _put(H, 0, 0, -1.0, scratch)
-    at_object = 6
-    # Position rows: p_co = R_ic^T (R_wi^T (p_wo - p_wi) - p_ic).
-    for i in range(3):
-        for j in range(3):
-            H[3 + i, 3 + j] = -R_wc[3 * j + i]
-    _transposed_times_skew(R_ic, p_io, scratch)
-    _put(H, 3, 0, 1.0, scratch)
-    if layout[AT_EXTRINSICS] >= 0:
-        at_object = 12
-        for i in range(3):
-            for j in range(3):
-                H[3 + i, 9 + j] = -R_ic[3 * j + i]
-        H[3, 7], H[3, 8], H[4, 6] = -p_co[2], p_co[1], p_co[2]
-        H[4, 8], H[5, 6], H[5, 7] = -p_co[0], -p_co[1], p_co[0]
-    if layout[AT_OBJECTS] >= 0:
-        multiply(block, R_co, scratch)
-        _put(H, 0, at_object, 1.0, scratch)
-        for i in range(3):
-            for j in range(3):
-                H[3 + i, at_object + 3 + j] = R_wc[3 * j + i]
+    write_rotation_rows(R_ic, R_co, inverse, layout, at_object, H, work)
+    write_position_rows(R_ic, R_wc, p_io, p_co, layout, at_object, H, work)
     if layout[N_BIAS_KINDS] > 0:
-        # t = (1 + c2) p + (-c1, c0, 0) x p turns and stretches the position rows so far.
-        for j in range(bias_start):
-            h0, h1, h2 = H[3, j], H[4, j], H[5, j]
-            H[3, j] = (1.0 + c2) * h0 + c0 * h2
-            H[4, j] = (1.0 + c2) * h1 + c1 * h2
-            H[5, j] = (1.0 + c2) * h2 - c0 * h0 - c1 * h1
-    left_jacobian(b0, b1, b2, 1.0, jacobian)
-    multiply(inverse, jacobian, block)
-    for i in range(9):
-        block[i] *= turning
-        axes[i] *= along if i % 3 == 2 else across
-    for bias in range(layout[N_BIAS_KINDS]):
-        _put(H, 0, bias_start + 6 * bias, 1.0, block)
-        _put(H, 3, bias_start + 6 * bias + 3, 1.0, axes)
-
-
-@njit(cache=True)
-def _put(H: Array, row: int, column: int, sign: float, block: Array) -> None:
-    for i in range(3):
-        for j in range(3):
-            H[row + i, column + j] = sign * block[3 * i + j]
-
-
-@njit(cache=True)
-def _transposed_times_skew(a: Array, v: Array, out: Array) -> None:
-    for i in range(3):
-        out[3 * i] = a[3 + i] * v[2] - a[6 + i] * v[1]
-        out[3 * i + 1] = a[6 + i] * v[0] - a[i] * v[2]
-        out[3 * i + 2] = a[i] * v[1] - a[3 + i] * v[0]
+        bias_position_rows(bias, bias_start, H)
+        write_bias_columns(bias, spread, axes, inverse, layout[N_BIAS_KINDS], bias_start, H, work)
