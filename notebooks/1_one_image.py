@@ -11,7 +11,8 @@
 # # 1 · One image
 #
 # From pixels to object poses: the embedded network looks at a rendered image that it was not trained on. Boxes
-# become queries, each query looks at a handful of points, and out come a pose and its uncertainty.
+# become queries, each query looks at a handful of points, out comes a pose, and a comparison with the object's model
+# makes it better and says how sure it is.
 
 # %%
 # %matplotlib inline
@@ -33,6 +34,7 @@ from poet_loc.io.bop import read_bop_scene
 from poet_loc.model.attention_points import attend
 from poet_loc.model.backbone import batch_images
 from poet_loc.model.embedded import load_embedded
+from poet_loc.model.object_views import render_points, seen_in_images, views_of
 
 folder = Path(tempfile.mkdtemp())
 views = RenderOptions(folder, "test", 3, 950000, 3, masks=False, depth=False, jobs=1, progress=False)
@@ -81,10 +83,29 @@ show(*drawn)
 network, _ = load_embedded()
 first, intrinsics = found[0]
 pixels = first.picture.pixels
-output, attention = attend(network, batch_images([to_tensor(pixels)], torch.tensor([intrinsics]), 32))
+batch = batch_images([to_tensor(pixels)], torch.tensor([intrinsics]), 32)
+output, attention = attend(network, batch)
 count = output.queries.counts[0]
 points, weights = attention.points[-1, :count].flatten(0, 1), attention.weights[-1, :count].flatten(0, 1)
 show(draw_attention(pixels, points.double().numpy(), weights.double().numpy()))
+
+# %% [markdown]
+# ## Models beside the image
+# The decoder's poses are a start. The refiner looks at each object (above) and at its model, drawn at that pose
+# (below), estimates how far one is from the other, and moves the model. Left: at the start; right: after its rounds.
+
+# %%
+with torch.no_grad():
+    start = network.poses(network.extract(batch), batch.mask, output.queries, batch.intrinsics)
+refiner, model = network.refiner, output.queries.classes[0, :count] - 1
+pairs = []
+for poses in (start, output):
+    views = views_of(poses.translation[0, :count], poses.rotation[0, :count], refiner.diameters[model])
+    image = seen_in_images(batch.images, batch.intrinsics, torch.zeros(count, dtype=torch.int64), views)
+    drawn_model = render_points(refiner.points[model], refiner.colours[model] / 255.0, views)[:, :3]
+    rows = [torch.cat(list(row), 2) for row in (image, drawn_model)]
+    pairs.append(torch.cat(rows, 1).permute(1, 2, 0).clamp(0, 1).numpy())
+show(*pairs)
 
 # %% [markdown]
 # ## How wrong, and how sure?
