@@ -196,7 +196,7 @@ class Start:
     """plus so much per second between them, m/s."""
     max_tilt_deg: float = 8.0
     """A vote that tilts the measured gravity by more is refused, deg."""
-    lost_window_s: float = 8.0
+    lost_window_s: float = 4.0
     """The filter is lost if in this time, s (or since its start, where that is less: a wrong one is mended soon),"""
     lost_share: float = 0.2
     """less than this share of the detections was used"""
