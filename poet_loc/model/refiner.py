@@ -15,6 +15,7 @@ from torch.nn import functional as F
 from poet_loc.core.input_error import at_least
 from poet_loc.model.flow_pose import CELL, flow_jacobian, solve_flow, step_pose
 from poet_loc.model.object_views import Views, render_points, seen_in_images, views_of
+from poet_loc.model.residual import ResidualBlock, convolve
 
 _CHANNELS = 10  # seen colours, drawn colours, object coordinates, drawn
 _CLASS_CODE = 64
@@ -67,22 +68,6 @@ class Comparison:
     corrected: Estimates
 
 
-class _Block(nn.Module):
-    def __init__(self, channels: int) -> None:
-        super().__init__()
-        self.conv1, self.norm1 = nn.Conv2d(channels, channels, 3, padding=1, bias=False), nn.BatchNorm2d(channels)
-        self.conv2, self.norm2 = nn.Conv2d(channels, channels, 3, padding=1, bias=False), nn.BatchNorm2d(channels)
-
-    def forward(self, x: Tensor) -> Tensor:
-        return F.relu(self.norm2(self.conv2(F.relu(self.norm1(self.conv1(x))))) + x)
-
-
-def _convolve(inputs: int, outputs: int, stride: int = 1) -> nn.Sequential:
-    return nn.Sequential(
-        nn.Conv2d(inputs, outputs, 3, stride, padding=1, bias=False), nn.BatchNorm2d(outputs), nn.ReLU()
-    )
-
-
 class PoseRefiner(nn.Module):
     """Network, models and rounds; needs intrinsics."""
 
@@ -99,11 +84,11 @@ class PoseRefiner(nn.Module):
         self.register_buffer("colours", torch.zeros(shape, dtype=torch.uint8))
         self.register_buffer("diameters", torch.ones(options.class_count))  # m
         fine, middle, coarse = options.widths
-        entry = nn.Sequential(nn.PixelUnshuffle(2), _convolve(4 * _CHANNELS, fine), _Block(fine))
-        self.fine = nn.Sequential(entry, _convolve(fine, middle, 2), _Block(middle))
-        self.coarse = nn.Sequential(_convolve(middle, coarse, 2), _Block(coarse))
+        entry = nn.Sequential(nn.PixelUnshuffle(2), convolve(4 * _CHANNELS, fine), ResidualBlock(fine))
+        self.fine = nn.Sequential(entry, convolve(fine, middle, 2), ResidualBlock(middle))
+        self.coarse = nn.Sequential(convolve(middle, coarse, 2), ResidualBlock(coarse))
         self.back = nn.Conv2d(coarse, middle, 1)
-        self.merge = _Block(middle)
+        self.merge = ResidualBlock(middle)
         self.flow = nn.Conv2d(middle, 4, 1)
         nn.init.normal_(self.flow.weight, std=0.01)
         nn.init.zeros_(self.flow.bias)  # type: ignore[arg-type]

@@ -16,6 +16,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from poet_loc.model.backbone import Backbone, BackboneShape, Features, ImageBatch
+from poet_loc.model.residual import ResidualBlock, convolve
 
 STRIDE = 8
 """Pixels per cell of the heads."""
@@ -55,25 +56,6 @@ class DetectorHeads:
     """(B, 1, h, w) logit of seeing an object."""
 
 
-class _Block(nn.Module):
-    """Two 3x3 convolutions around a shortcut."""
-
-    def __init__(self, channels: int) -> None:
-        super().__init__()
-        self.conv1, self.norm1 = nn.Conv2d(channels, channels, 3, padding=1, bias=False), nn.BatchNorm2d(channels)
-        self.conv2, self.norm2 = nn.Conv2d(channels, channels, 3, padding=1, bias=False), nn.BatchNorm2d(channels)
-
-    def forward(self, x: Tensor) -> Tensor:
-        y = F.relu(self.norm1(self.conv1(x)), inplace=True)
-        return F.relu(self.norm2(self.conv2(y)).add_(x), inplace=True)
-
-
-def _convolve(inputs: int, outputs: int, stride: int = 1) -> nn.Sequential:
-    return nn.Sequential(
-        nn.Conv2d(inputs, outputs, 3, stride, padding=1, bias=False), nn.BatchNorm2d(outputs), nn.ReLU(inplace=True)
-    )
-
-
 class SmallDetector(Backbone):
     """The detector of the embedded pose sensor; maps at strides 8, 16 and 32."""
 
@@ -83,13 +65,13 @@ class SmallDetector(Backbone):
         widths, pyramid = options.widths, options.pyramid_dim
         # 4x4 pixels become the channels of one cell: no map is ever finer than stride 4
         self.patches = nn.PixelUnshuffle(4)
-        entries = [_convolve(48, widths[0])] + [_convolve(a, b, 2) for a, b in pairwise(widths)]
+        entries = [convolve(48, widths[0])] + [convolve(a, b, 2) for a, b in pairwise(widths)]
         self.stages = nn.ModuleList(
-            nn.Sequential(entry, *[_Block(width) for _ in range(count)])
+            nn.Sequential(entry, *[ResidualBlock(width) for _ in range(count)])
             for entry, width, count in zip(entries, widths, options.blocks)
         )
         self.lateral = nn.ModuleList(nn.Conv2d(width, pyramid, 1) for width in widths[1:])
-        self.merge = _convolve(pyramid, pyramid)
+        self.merge = convolve(pyramid, pyramid)
         self.heat = _head(pyramid, options.class_count, -4.6)  # a prior of 1 %, T.-Y. Lin et al., "RetinaNet" (2017)
         self.sides = _head(pyramid, 4, 1.0)
         self.surface = _head(pyramid, 4, 0.0)
