@@ -16,10 +16,26 @@ import math
 
 import numpy as np
 
+from fusion.ballot import (
+    AT_ITS_PLACE,
+    CORRECTION_SIZE,
+    LEAD,
+    MAX_ANGLE,
+    MAX_DISTANCE,
+    MAX_LEVER,
+    MAX_SPEED,
+    MAX_TILT,
+    MIN_VOTES,
+    WHOLE,
+    Ballot,
+    Correction,
+    correction_in,
+    seconds_since,
+)
 from fusion.compiled import njit
-from fusion.nav_state import Array, Ints
+from fusion.nav_state import Array
 from fusion.so3_kernels import apply, multiply
-from fusion.start_fit import AT_ITS_PLACE, WHOLE, fit_correction, shift_of
+from fusion.start_fit import fit_correction, shift_of
 from fusion.votes import (
     VOTE_ARM,
     VOTE_DISTANCE,
@@ -31,41 +47,139 @@ from fusion.votes import (
     turn_of_vote,
 )
 
-# Places in the options of the start.
-(
-    MIN_VOTES,
-    LONGEST_WINDOW_S,
-    MAX_ANGLE,
-    MAX_DISTANCE,
-    MAX_LEVER,
-    MAX_SPEED,
-    MAX_TILT,
-    START_WINDOW_S,
-    START_MIN_SPAN_S,
-    LOST_WINDOW_S,
-    LOST_SHARE,
-    LOST_MIN_VOTES,
-    MIN_SHARE,
-    MIN_OBJECTS,
-    MIN_PLACES,
-    LEAD,
-    IS_GIVEN,
-    GIVEN_POSE,
-) = range(18)
-GIVEN_POSE_SIZE = 12  # rotation, position
+
+@njit(cache=True)
+def largest_agreement(ballot: Ballot, found: Correction, by_places: bool) -> tuple[int, float, int, int]:
+    """Find the correction that most votes agree on, for the origin that it has.
+
+    by_places: votes agree if their object is at its place, however it seems turned; then gravity must be felt.
+
+    Returns how many votes agree and their span (s), how many objects are at their places, and how many agree whole:
+    in half of their votes, and in half as many as a start needs.
+    """
+    seed = _search(ballot, found, 0.0, found, False, by_places)
+    if seed < 0:
+        return 0, 0.0, 0, 0
+    _fit(ballot, found, seed)
+    what = AT_ITS_PLACE if by_places else WHOLE
+    count, oldest, newest = 0, ballot.now, ballot.stamps[seed]
+    for a in range(ballot.first, ballot.head):
+        i = a & (len(ballot.stamps) - 1)
+        if found.agreed[i] & what:
+            count, oldest, newest = count + 1, min(oldest, ballot.stamps[i]), max(newest, ballot.stamps[i])
+    return (
+        count,
+        max(0.0, (newest - oldest) * 1e-9),
+        _objects(ballot, found, AT_ITS_PLACE),
+        _objects(ballot, found, WHOLE),
+    )
 
 
 @njit(cache=True)
-def _offset(
-    votes: Array, i: int, C: Array, origin: Array, gravity: Array, since: float, d: Array, scratch: Array
-) -> None:
-    """Write the d of a correction p_true = C (p_integrated - o) + d that puts the object of vote i at its place."""
-    turned, arm = scratch[0:9], scratch[9:12]
-    multiply(C, votes[i, 12:21], turned)
-    apply(turned, votes[i, VOTE_ARM], votes[i, VOTE_ARM + 1], votes[i, VOTE_ARM + 2], arm)
-    shift_of(votes, i, C, origin, gravity, since, d)
+def _objects(ballot: Ballot, correction: Correction, what: int) -> int:
+    """Return how many objects agree in half of their votes, and in half as many as a start needs."""
+    seen, agreeing = ballot.scratch[160:192], ballot.scratch[192:224]
+    for k in range(32):
+        seen[k] = agreeing[k] = 0.0
+    for a in range(ballot.first, ballot.head):
+        i = a & (len(ballot.stamps) - 1)
+        k = int(ballot.votes[i, VOTE_OBJECT])
+        if k >= 0:
+            seen[k & 31] += 1.0
+            agreeing[k & 31] += correction.agreed[i] & what != 0
+    count = 0
+    for k in range(32):
+        count += agreeing[k] >= 0.5 * max(ballot.options[MIN_VOTES], seen[k])
+    return count
+
+
+@njit(cache=True)
+def objects_seen(ballot: Ballot) -> int:
+    """Return how many objects cast the votes."""
+    seen, count = 0, 0
+    for a in range(ballot.first, ballot.head):
+        k = int(ballot.votes[a & (len(ballot.stamps) - 1), VOTE_OBJECT])
+        seen |= 1 << (k & 31) if k >= 0 else 0
+    while seen > 0:
+        count += seen & 1
+        seen >>= 1
+    return count
+
+
+@njit(cache=True)
+def has_rival(ballot: Ballot, found: Correction) -> bool:
+    """Tell whether quite another correction than the one that `largest_agreement` found is nearly as well supported."""
+    room, lead = ballot.scratch[118 : 118 + CORRECTION_SIZE], ballot.options[LEAD]
+    rival = correction_in(room, np.zeros(len(ballot.stamps), dtype=np.int64))
+    for j in range(6):
+        rival.origin[j] = found.origin[j]
+    if _search(ballot, rival, found.support[0] / lead, found, True, False) >= 0:
+        return True
+    # What a velocity that is not known yet hides shows once it is fitted, as it was for the correction itself.
+    seed = _search(ballot, rival, 0.0, found, True, False)
+    if seed < 0:
+        return False
+    _fit(ballot, rival, seed)
+    if not _is_another(ballot, seed, rival, 0.0, found):
+        return False
+    return _support(ballot, rival, -1, 0.0) * lead > _support(ballot, found, -1, 0.0)
+
+
+@njit(cache=True)
+def _search(ballot: Ballot, best: Correction, least: float, found: Correction, elsewhere: bool, pairs: bool) -> int:
+    """Write the best supported correction of all that votes ask for to `best`; return the vote that asked, -1: none.
+
+    Its support must exceed `least`; elsewhere: it must be quite another than `found`. pairs: any two objects may ask
+    for one, not only where one is a can that stands.
+    """
+    asked, seed = correction_in(ballot.scratch[48 : 48 + CORRECTION_SIZE], best.agreed), -1
+    best.support[0] = least
     for j in range(3):
-        d[j] = votes[i, VOTE_PLACE + j] - arm[j] - d[j]
+        best.v[j] = asked.v[j] = 0.0
+    for j in range(6):
+        asked.origin[j] = best.origin[j]
+    for a in range(ballot.first, ballot.head):
+        i = a & (len(ballot.stamps) - 1)
+        for way in range(_ways(ballot, i, pairs)):
+            if not _asks(ballot, i, way, asked):
+                continue
+            if elsewhere and not _is_another(ballot, i, asked, seconds_since(ballot, i), found):
+                continue
+            support = _support(ballot, asked, i, best.support[0])
+            if support > best.support[0]:
+                best.support[0], seed = support, i
+                for j in range(9):
+                    best.C[j] = asked.C[j]
+                for j in range(3):
+                    best.d[j] = asked.d[j]
+    return seed
+
+
+@njit(cache=True)
+def _ways(ballot: Ballot, i: int, pairs: bool) -> int:
+    """Return how many corrections vote i may ask for: one per look-alike; then beside each other vote of its stamp."""
+    newest = ballot.stamps[(ballot.head - 1) & (len(ballot.stamps) - 1)]
+    order = int(ballot.votes[i, VOTE_ORDER])
+    beside = (order == 0 or pairs) and ballot.stamps[i] == newest
+    return max(order, 1) + (ballot.head - ballot.first if beside else 0)
+
+
+@njit(cache=True)
+def _asks(ballot: Ballot, i: int, way: int, asked: Correction) -> bool:
+    """Write the correction that vote i asks for in one of its ways; False: it asks for none, or gravity forbids it."""
+    votes, stamps = ballot.votes, ballot.stamps
+    turns = max(int(votes[i, VOTE_ORDER]), 1)
+    if way < turns:
+        turned = turn_of_vote(votes[i], way, ballot.up, asked.C, ballot.scratch)
+    else:
+        k = (ballot.first + way - turns) & (len(stamps) - 1)
+        turned = stamps[k] == stamps[i] and votes[k, VOTE_OBJECT] != votes[i, VOTE_OBJECT]
+        turned = turned and votes[k, VOTE_OBJECT] >= 0.0
+        turned = turned and turn_of_pair(votes[i], votes[k], ballot.up, asked.C, ballot.scratch)
+    if not turned or _tilt(asked.C, ballot.up) > ballot.options[MAX_TILT]:
+        return False
+    _put_at_its_place(ballot, i, asked)
+    return True
 
 
 @njit(cache=True)
@@ -79,36 +193,83 @@ def _tilt(C: Array, up: Array) -> float:
 
 
 @njit(cache=True)
-def _agree(
-    votes: Array,
-    i: int,
-    C: Array,
-    d: Array,
-    v: Array,
-    origin: Array,
-    gravity: Array,
-    since: float,
-    cosine: float,
-    distance: float,
-    scratch: Array,
-) -> tuple[int, float]:
-    """Tell what of vote i lies within an angle and a distance of the correction (C, d + v * since), and how well.
+def _put_at_its_place(ballot: Ballot, i: int, correction: Correction) -> None:
+    """Write the d of a correction that puts the object of vote i at its place."""
+    turned, arm, vote, d = ballot.scratch[0:9], ballot.scratch[9:12], ballot.votes[i], correction.d
+    multiply(correction.C, vote[12:21], turned)
+    apply(turned, vote[VOTE_ARM], vote[VOTE_ARM + 1], vote[VOTE_ARM + 2], arm)
+    shift_of(ballot, i, correction, d)
+    for j in range(3):
+        d[j] = vote[VOTE_PLACE + j] - arm[j] - d[j]
+
+
+@njit(cache=True)
+def _is_another(ballot: Ballot, i: int, one: Correction, since: float, found: Correction) -> bool:
+    """Tell whether a correction that vote i asked for is further from `found` than poor votes for the same one may be.
+
+    Both are compared where they put the imu at a time (s).
+    """
+    options, trace, gap = ballot.options, 0.0, 0.0
+    for j in range(9):
+        trace += one.C[j] * found.C[j]
+    for j in range(3):
+        gap += (one.d[j] - found.d[j] - since * found.v[j]) ** 2
+    reach = 4.0 * (options[MAX_DISTANCE] + options[MAX_LEVER] * ballot.votes[i, VOTE_DISTANCE])
+    return 0.5 * (trace - 1.0) < math.cos(min(3.0 * options[MAX_ANGLE], math.pi)) or gap > reach * reach
+
+
+@njit(cache=True)
+def _fit(ballot: Ballot, correction: Correction, seed: int) -> None:
+    """Fit a correction that vote `seed` asked for to the votes that agree, and choose these anew."""
+    _mark(ballot, correction, seed)
+    for _ in range(3):
+        fit_correction(ballot, correction)
+        _mark(ballot, correction, -1)
+
+
+@njit(cache=True)
+def _support(ballot: Ballot, correction: Correction, seed: int, least: float) -> float:
+    """Return how much votes support a correction; the sum stops where it cannot exceed `least` any more.
+
+    seed: the vote that asked for it, which knows no velocity yet; -1: its velocity is fitted.
+    """
+    total, cosine = 0.0, math.cos(ballot.options[MAX_ANGLE])
+    for a in range(ballot.first, ballot.head):
+        if total + 2.0 * (ballot.head - a) <= least:
+            break
+        total += _agree(ballot, a & (len(ballot.stamps) - 1), correction, seed, cosine)[1]
+    return total
+
+
+@njit(cache=True)
+def _mark(ballot: Ballot, correction: Correction, seed: int) -> None:
+    """Write down what of each vote agrees with a correction; seed as in `_support`."""
+    cosine = math.cos(ballot.options[MAX_ANGLE])
+    for a in range(ballot.first, ballot.head):
+        i = a & (len(ballot.stamps) - 1)
+        correction.agreed[i] = _agree(ballot, i, correction, seed, cosine)[0]
+
+
+@njit(cache=True)
+def _agree(ballot: Ballot, i: int, correction: Correction, seed: int, cosine: float) -> tuple[int, float]:
+    """Tell what of vote i agrees with a correction, within an angle and a distance, and how well.
 
     Bits: AT_ITS_PLACE, the object is where the map says; WHOLE, the pose of the imu is the one voted for. Each supports
     the correction by one less its squared share of what is allowed. Source: P. Torr and A. Zisserman, "MLESAC", CVIU 78
     (2000), the score of MSAC.
     """
-    turned, shift, fitted = scratch[0:9], scratch[9:12], scratch[12:24]
-    multiply(C, votes[i, 12:21], turned)
-    shift_of(votes, i, C, origin, gravity, since, shift)
-    arm, agrees, support, total = scratch[24:27], 0, 0.0, 0.0
-    apply(turned, votes[i, VOTE_ARM], votes[i, VOTE_ARM + 1], votes[i, VOTE_ARM + 2], arm)
+    vote, scratch, since = ballot.votes[i], ballot.scratch, seconds_since(ballot, i)
+    turned, shift, fitted, arm = scratch[0:9], scratch[9:12], scratch[12:24], scratch[24:27]
+    agrees, support, total, distance = 0, 0.0, 0.0, _reach(ballot, i, seed)
+    multiply(correction.C, vote[12:21], turned)
+    shift_of(ballot, i, correction, shift)
+    apply(turned, vote[VOTE_ARM], vote[VOTE_ARM + 1], vote[VOTE_ARM + 2], arm)
     for j in range(3):
-        shift[j] += d[j] + v[j] * since
-        total += (votes[i, VOTE_PLACE + j] - arm[j] - shift[j]) ** 2
-    if total <= distance * distance and votes[i, VOTE_OBJECT] >= 0.0:
+        shift[j] += correction.d[j] + correction.v[j] * since
+        total += (vote[VOTE_PLACE + j] - arm[j] - shift[j]) ** 2
+    if total <= distance * distance and vote[VOTE_OBJECT] >= 0.0:
         agrees, support = AT_ITS_PLACE, 1.0 - total / distance**2
-    fit_vote(votes[i], turned, fitted, scratch[27:48])
+    fit_vote(vote, turned, fitted, scratch[27:48])
     trace, total = 0.0, 0.0
     for j in range(9):
         trace += turned[j] * fitted[j]
@@ -119,277 +280,10 @@ def _agree(
 
 
 @njit(cache=True)
-def largest_agreement(
-    votes: Array,
-    stamps: Ints,
-    first: int,
-    head: int,
-    now: int,
-    up: Array,
-    origin: Array,
-    gravity: Array,
-    options: Array,
-    C: Array,
-    d: Array,
-    v: Array,
-    by_places: bool,
-    inlier: Ints,
-    scratch: Array,
-) -> tuple[int, float, int, int]:
-    """Find the correction most votes agree on; write it to C (9,), d (3,), v (3,).
-
-    by_places: votes agree if their object is at its place, however it seems turned; then gravity must be felt.
-
-    Returns how many votes agree and their span (s), how many objects are at their places, and how many agree whole:
-    in half of their votes, and in half as many as a start needs.
-
-    votes is a ring whose entries first..head-1 (modulo its length, a power of two) count; inlier (ring length) marks
-    what of each agrees. origin (6,) is the position and velocity that the correction replaces; v is fitted to the
-    agreeing votes, so that at stamp `now` position and velocity become d and v. scratch holds 256 floats.
-    """
-    mask, cosine = len(stamps) - 1, math.cos(options[MAX_ANGLE])
-    seed = _search(
-        votes, stamps, first, head, now, up, origin, gravity, options, C, d, v, 0.0, False, by_places, inlier, scratch
-    )
-    if seed < 0:
-        return 0, 0.0, 0, 0
-    for j in range(3):
-        v[j] = 0.0
-    what = AT_ITS_PLACE if by_places else WHOLE
-    _mark(votes, stamps, first, head, now, origin, gravity, options, seed, C, d, v, -1.0, what, inlier, scratch)
-    for _ in range(3):
-        _refine(votes, stamps, first, head, now, up, origin, gravity, options, C, d, v, what, inlier, scratch)
-    count, objects, alike, oldest, newest = 0, 0, 0, now, stamps[seed]
-    at_place, whole, seen = scratch[160:192], scratch[192:224], scratch[224:256]
-    for k in range(32):
-        at_place[k] = whole[k] = seen[k] = 0.0
-    for a in range(first, head):
-        j = a & mask
-        reach = options[MAX_DISTANCE] + options[MAX_LEVER] * votes[j, VOTE_DISTANCE]
-        agrees, _ = _agree(votes, j, C, d, v, origin, gravity, (stamps[j] - now) * 1e-9, cosine, reach, scratch)
-        k = int(votes[j, VOTE_OBJECT])
-        if k >= 0:
-            seen[k & 31] += 1.0
-            at_place[k & 31] += agrees & AT_ITS_PLACE != 0
-            whole[k & 31] += agrees & WHOLE != 0
-        if inlier[j] & what:
-            count, oldest, newest = count + 1, min(oldest, stamps[j]), max(newest, stamps[j])
-    for k in range(32):
-        enough = 0.5 * max(options[MIN_VOTES], seen[k])
-        objects += at_place[k] >= enough
-        alike += whole[k] >= enough
-    return count, max(0.0, (newest - oldest) * 1e-9), objects, alike
-
-
-@njit(cache=True)
-def objects_seen(votes: Array, first: int, head: int) -> int:
-    """Return how many objects cast the votes first..head-1."""
-    seen, count = 0, 0
-    for a in range(first, head):
-        k = int(votes[a & (len(votes) - 1), VOTE_OBJECT])
-        seen |= 1 << (k & 31) if k >= 0 else 0
-    while seen > 0:
-        count += seen & 1
-        seen >>= 1
-    return count
-
-
-@njit(cache=True)
-def has_rival(
-    votes: Array,
-    stamps: Ints,
-    first: int,
-    head: int,
-    now: int,
-    up: Array,
-    origin: Array,
-    gravity: Array,
-    options: Array,
-    C: Array,
-    d: Array,
-    v: Array,
-    inlier: Ints,
-    scratch: Array,
-) -> bool:
-    """Tell whether quite another correction than the one that `largest_agreement` found is nearly as well supported."""
-    other = scratch[117:132]
-    for j in range(9):
-        other[j] = C[j]
-    for j in range(3):
-        other[9 + j], other[12 + j] = d[j], v[j]
-    least, C2, d2, v2 = scratch[147] / options[LEAD], scratch[132:141], scratch[141:144], scratch[144:147]
-    found = _search(
-        votes, stamps, first, head, now, up, origin, gravity, options, C2, d2, v2, least, True, False, inlier, scratch
-    )
-    if found >= 0:
-        return True
-    # What a velocity that is not known yet hides shows once it is fitted, as it was for the correction itself.
-    found = _search(
-        votes, stamps, first, head, now, up, origin, gravity, options, C2, d2, v2, 0.0, True, False, inlier, scratch
-    )
-    if found < 0:
-        return False
-    marks = np.zeros(len(stamps), dtype=np.int64)
-    _mark(votes, stamps, first, head, now, origin, gravity, options, found, C2, d2, v2, -1.0, WHOLE, marks, scratch)
-    for _ in range(3):
-        _refine(votes, stamps, first, head, now, up, origin, gravity, options, C2, d2, v2, WHOLE, marks, scratch)
-    if not _is_another(votes[found, VOTE_DISTANCE], C2, d2, 0.0, options, scratch):
-        return False
-    of_rival = _mark(votes, stamps, first, head, now, origin, gravity, options, -1, C2, d2, v2, 0.0, 0, marks, scratch)
-    own = _mark(votes, stamps, first, head, now, origin, gravity, options, -1, C, d, v, 0.0, 0, marks, scratch)
-    return of_rival * options[LEAD] > own
-
-
-@njit(cache=True)
-def _search(
-    votes: Array,
-    stamps: Ints,
-    first: int,
-    head: int,
-    now: int,
-    up: Array,
-    origin: Array,
-    gravity: Array,
-    options: Array,
-    C: Array,
-    d: Array,
-    still: Array,
-    least: float,
-    elsewhere: bool,
-    pairs: bool,
-    inlier: Ints,
-    scratch: Array,
-) -> int:
-    """Write the best supported correction of all that votes ask for to C and d; return the vote that asked, -1: none.
-
-    Its support must exceed `least`; elsewhere: it must be quite another than that in scratch[117:132], else its support
-    is left in scratch[147]. pairs: any two objects may ask for one, not only where one is a can that stands.
-    """
-    mask, best, seed, newest = len(stamps) - 1, least, -1, stamps[(head - 1) & (len(stamps) - 1)]
-    C1, d1 = scratch[48:57], scratch[57:60]
-    for j in range(3):
-        still[j] = 0.0
-    for a in range(first, head):
-        i = a & mask
-        order, since = int(votes[i, VOTE_ORDER]), (stamps[i] - now) * 1e-9
-        turns = max(order, 1)
-        others = head - first if (order == 0 or pairs) and stamps[i] == newest else 0
-        for b in range(turns + others):
-            if b < turns:
-                asked = turn_of_vote(votes[i], b, up, C1, scratch)
-            else:
-                k = (first + b - turns) & mask
-                asked = stamps[k] == newest and votes[k, VOTE_OBJECT] != votes[i, VOTE_OBJECT]
-                asked = asked and votes[k, VOTE_OBJECT] >= 0.0 and turn_of_pair(votes[i], votes[k], up, C1, scratch)
-            if not asked or _tilt(C1, up) > options[MAX_TILT]:
-                continue
-            _offset(votes, i, C1, origin, gravity, since, d1, scratch)
-            if elsewhere and not _is_another(votes[i, VOTE_DISTANCE], C1, d1, since, options, scratch):
-                continue
-            support = _mark(
-                votes,
-                stamps,
-                first,
-                head,
-                now,
-                origin,
-                gravity,
-                options,
-                i,
-                C1,
-                d1,
-                still,
-                best,
-                0,
-                inlier,
-                scratch,
-            )
-            if support > best:
-                best, seed = support, i
-                for j in range(9):
-                    C[j] = C1[j]
-                for j in range(3):
-                    d[j] = d1[j]
-    if not elsewhere:
-        scratch[147] = best
-    return seed
-
-
-@njit(cache=True)
-def _is_another(distance: float, C: Array, d: Array, since: float, options: Array, scratch: Array) -> bool:
-    """Tell whether a correction is further from that in scratch[117:132] than poor votes for the same one may be."""
-    trace, gap = 0.0, 0.0
-    for j in range(9):
-        trace += C[j] * scratch[117 + j]
-    for j in range(3):
-        gap += (d[j] - scratch[126 + j] - since * scratch[129 + j]) ** 2
-    reach = 4.0 * (options[MAX_DISTANCE] + options[MAX_LEVER] * distance)
-    return 0.5 * (trace - 1.0) < math.cos(min(3.0 * options[MAX_ANGLE], math.pi)) or gap > reach * reach
-
-
-@njit(cache=True)
-def _mark(
-    votes: Array,
-    stamps: Ints,
-    first: int,
-    head: int,
-    now: int,
-    origin: Array,
-    gravity: Array,
-    options: Array,
-    seed: int,
-    C: Array,
-    d: Array,
-    v: Array,
-    least: float,
-    what: int,
-    inlier: Ints,
-    scratch: Array,
-) -> float:
-    """Return how much votes support the correction of one of them, which knows no velocity yet (seed -1: it does).
-
-    Stops where the sum cannot exceed `least` any more; what: 0, or else mark what of each vote agrees.
-    """
-    support, cosine = 0.0, math.cos(options[MAX_ANGLE])
-    for b in range(first, head):
-        if what == 0 and support + 2.0 * (head - b) <= least:
-            return support
-        j = b & (len(stamps) - 1)
-        reach = options[MAX_DISTANCE] + options[MAX_LEVER] * votes[j, VOTE_DISTANCE]
-        if seed >= 0:
-            reach += options[MAX_SPEED] * abs(stamps[seed] - stamps[j]) * 1e-9
-        agrees, well = _agree(votes, j, C, d, v, origin, gravity, (stamps[j] - now) * 1e-9, cosine, reach, scratch)
-        support += well
-        if what > 0:
-            inlier[j] = agrees
-    return support
-
-
-@njit(cache=True)
-def _refine(
-    votes: Array,
-    stamps: Ints,
-    first: int,
-    head: int,
-    now: int,
-    up: Array,
-    origin: Array,
-    gravity: Array,
-    options: Array,
-    C: Array,
-    d: Array,
-    v: Array,
-    what: int,
-    inlier: Ints,
-    scratch: Array,
-) -> None:
-    """Fit the correction to the votes that agree, and choose these anew."""
-    fit_correction(
-        votes, stamps, first, head, now, up, origin, gravity, options[MAX_SPEED], options[MAX_TILT], C, d, v, inlier
-    )
-    cosine = math.cos(options[MAX_ANGLE])
-    for a in range(first, head):
-        i = a & (len(stamps) - 1)
-        reach = options[MAX_DISTANCE] + options[MAX_LEVER] * votes[i, VOTE_DISTANCE]
-        agrees, _ = _agree(votes, i, C, d, v, origin, gravity, (stamps[i] - now) * 1e-9, cosine, reach, scratch)
-        inlier[i] = agrees
+def _reach(ballot: Ballot, i: int, seed: int) -> float:
+    """Return how far off (m) vote i may be; more where the velocity since the vote that asked is not known."""
+    options = ballot.options
+    reach = options[MAX_DISTANCE] + options[MAX_LEVER] * ballot.votes[i, VOTE_DISTANCE]
+    if seed >= 0:
+        reach += options[MAX_SPEED] * abs(ballot.stamps[seed] - ballot.stamps[i]) * 1e-9
+    return reach

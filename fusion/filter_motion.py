@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import math
 
+from fusion.ballot import START_WINDOW_S
 from fusion.compiled import njit
-from fusion.consensus import START_WINDOW_S
 from fusion.imu import propagate_covariance, propagate_nominal, transition_blocks, write_gravity_basis
 from fusion.memory import (
     BIAS_TIME,

@@ -9,9 +9,9 @@ from __future__ import annotations
 
 import math
 
+from fusion.ballot import MAX_TILT, agreed_correction
 from fusion.columns import Columns
 from fusion.compiled import njit
-from fusion.consensus import MAX_TILT
 from fusion.measurements import OBJECT_POSE, object_in_world
 from fusion.memory import ANCHOR, NOW, SUPPOSED, Memory, Work
 from fusion.nav_state import OBJECT_SIZE, OBJECTS, POSITION, TIME_OFFSET, Array, Ints
@@ -53,7 +53,7 @@ def suppose(m: Memory, w: Work, log: Columns, j: int) -> int:
     """Take detection j into the hypotheses of its object's pose.
 
     Returns PUT where the object is to be put where this detection sees it; START_AGAIN where it is the object that
-    anchors the world, and the world is to be moved as w.step[96:117] then says (`consensus`); else WAIT.
+    anchors the world, and the world is to be moved as the agreed correction then says; else WAIT.
     """
     k, translation = log.objects[j], log.translations[j]
     if len(m.supposed) == 0 or (m.known[k] > 0.0 and m.meeting[REPLACE] == 0.0):
@@ -92,11 +92,12 @@ def forget_rivals(m: Memory, all_of_them: bool) -> None:
 
 @njit(cache=True)
 def _world_turn(m: Memory, w: Work, T: Array) -> bool:
-    """Write the correction that takes a world in which the anchor stands at T (12,) to the one of the map.
+    """Agree on the correction that takes a world in which the anchor stands at T (12,) to the one of the map.
 
     It turns about the vertical only, where there is one; a pose of the anchor that would take more is none.
     """
-    at, turn, C = OBJECTS + OBJECT_SIZE * (m.counters[ANCHOR] - 1), w.step[72:81], w.step[96:105]
+    agreed = agreed_correction(m, w)
+    at, turn, C = OBJECTS + OBJECT_SIZE * (m.counters[ANCHOR] - 1), w.step[72:81], agreed.C
     multiply_transposed_right(m.x[at : at + 9], T, turn)
     exp_so3(0.0, 0.0, math.atan2(turn[3] - turn[1], turn[0] + turn[4]), C)
     trace = C[0] * turn[0] + C[1] * turn[1] + C[3] * turn[3] + C[4] * turn[4] + turn[8]
@@ -105,11 +106,10 @@ def _world_turn(m: Memory, w: Work, T: Array) -> bool:
             C[i] = turn[i]
     elif trace < 1.0 + 2.0 * math.cos(m.start[MAX_TILT]):
         return False
-    apply(C, m.x[POSITION] - T[9], m.x[POSITION + 1] - T[10], m.x[POSITION + 2] - T[11], w.step[105:108])
-    for i in range(3):
-        w.step[105 + i] += m.x[at + 9 + i]
-    for i in range(9):  # no velocity to add, nothing taken off
-        w.step[108 + i] = 0.0
+    apply(C, m.x[POSITION] - T[9], m.x[POSITION + 1] - T[10], m.x[POSITION + 2] - T[11], agreed.d)
+    for i in range(3):  # no velocity to add, nothing taken off
+        agreed.d[i] += m.x[at + 9 + i]
+        agreed.v[i] = agreed.origin[i] = agreed.origin[3 + i] = 0.0
     return True
 
 

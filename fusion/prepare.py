@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from fusion import consensus, filter_update, imu, meeting, memory, object_biases, odometry, place_watch
+from fusion import ballot, filter_update, imu, meeting, memory, object_biases, odometry, place_watch
 from fusion.bias_spread import spread_model, white_part
 from fusion.measurements import CAMERA_POSE, OBJECT_POSE, Measurements, ray_aligned_covariance
 from fusion.motion_source import Kind, motion_source, odometry_steps
@@ -201,7 +201,7 @@ def fill_memory(problem: Problem, options: FuseOptions) -> tuple[Array, NDArray[
     )
     m.noise[imu.MEASURED] = options.imu.measured and problem.motion in WITH_IMU
     m.limits[: filter_update.SETTLED + 1] = _limits(options)
-    m.start[: consensus.LEAD + 1] = _start(options)
+    m.start[: ballot.LEAD + 1] = _start(options)
     if options.start.pose is not None:
         _start_at(options.start.pose, options, m)
     m.spread_model[:] = spread_model(options.noise)
@@ -229,7 +229,7 @@ def _without_imu(problem: Problem, options: FuseOptions, m: memory.Memory) -> No
     """Change what an IMU has and another source of motion has not."""
     if problem.motion in WITH_IMU:
         return
-    m.start[consensus.MAX_TILT] = math.pi
+    m.start[ballot.MAX_TILT] = math.pi
     m.noise[imu.GAP_S] = math.inf
     m.prior[GYRO_BIAS_ERROR:CORE] = 1e-9
     if problem.motion == "constant-velocity":
@@ -295,22 +295,22 @@ def _bias_model(bias: DetectionBias) -> list[float]:
 def _start(options: FuseOptions) -> list[float]:
     start = options.start
     values = {
-        consensus.MIN_VOTES: start.min_votes,
-        consensus.LONGEST_WINDOW_S: start.longest_window_s,
-        consensus.MAX_ANGLE: math.radians(start.max_angle_deg),
-        consensus.MAX_DISTANCE: start.max_distance,
-        consensus.MAX_LEVER: start.max_lever,
-        consensus.MAX_SPEED: start.max_speed,
-        consensus.MAX_TILT: math.radians(start.max_tilt_deg),
-        consensus.START_WINDOW_S: start.window_s,
-        consensus.START_MIN_SPAN_S: start.min_span_s,
-        consensus.LOST_WINDOW_S: start.lost_window_s,
-        consensus.LOST_SHARE: start.lost_share,
-        consensus.LOST_MIN_VOTES: start.lost_min_votes,
-        consensus.MIN_SHARE: start.min_share,
-        consensus.MIN_OBJECTS: start.min_objects,
-        consensus.MIN_PLACES: start.min_places,
-        consensus.LEAD: start.lead,
+        ballot.MIN_VOTES: start.min_votes,
+        ballot.LONGEST_WINDOW_S: start.longest_window_s,
+        ballot.MAX_ANGLE: math.radians(start.max_angle_deg),
+        ballot.MAX_DISTANCE: start.max_distance,
+        ballot.MAX_LEVER: start.max_lever,
+        ballot.MAX_SPEED: start.max_speed,
+        ballot.MAX_TILT: math.radians(start.max_tilt_deg),
+        ballot.START_WINDOW_S: start.window_s,
+        ballot.START_MIN_SPAN_S: start.min_span_s,
+        ballot.LOST_WINDOW_S: start.lost_window_s,
+        ballot.LOST_SHARE: start.lost_share,
+        ballot.LOST_MIN_VOTES: start.lost_min_votes,
+        ballot.MIN_SHARE: start.min_share,
+        ballot.MIN_OBJECTS: start.min_objects,
+        ballot.MIN_PLACES: start.min_places,
+        ballot.LEAD: start.lead,
     }
     return [float(values[i]) for i in range(len(values))]
 
@@ -320,8 +320,8 @@ def _start_at(pose: Sequence[float], options: FuseOptions, m: memory.Memory) -> 
     if options.estimate.map == "unknown":
         raise InputError("start.pose and an unknown map: its first object is what makes the world", fix="leave one out")
     rotation = Rotation.from_quat(pose[3:]).as_matrix().ravel()
-    m.start[consensus.IS_GIVEN] = 1.0
-    m.start[consensus.GIVEN_POSE : consensus.GIVEN_POSE + consensus.GIVEN_POSE_SIZE] = np.r_[rotation, pose[:3]]
+    m.start[ballot.IS_GIVEN] = 1.0
+    m.start[ballot.GIVEN_POSE : ballot.GIVEN_POSE + ballot.GIVEN_POSE_SIZE] = np.r_[rotation, pose[:3]]
 
 
 def _moved(options: FuseOptions) -> list[float]:

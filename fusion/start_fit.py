@@ -10,9 +10,10 @@ import math
 
 import numpy as np
 
+from fusion.ballot import MAX_SPEED, MAX_TILT, WHOLE, Ballot, Correction, seconds_since
 from fusion.compiled import njit
 from fusion.eskf import cholesky
-from fusion.nav_state import Array, Ints
+from fusion.nav_state import Array
 from fusion.so3_kernels import apply, exp_so3, log_so3, multiply, multiply_transposed_right
 from fusion.votes import (
     VOTE_ACROSS,
@@ -26,23 +27,22 @@ from fusion.votes import (
     fit_vote,
 )
 
-AT_ITS_PLACE, WHOLE = 1, 2  # what of a vote agrees
-
 _ANY_HEADING = math.pi**-2  # 1 / rad^2: what is known of an attitude of which no vote tells
 _EXACT = 1e-12  # rad^2, m^2: what says that it knows no error
 _OTHERS = 32  # where camera poses are counted, beside the objects
 
 
 @njit(cache=True)
-def shift_of(votes: Array, i: int, C: Array, origin: Array, gravity: Array, since: float, out: Array) -> None:
-    """Write where a correction C puts the displacement that the integrated motion had at vote i.
+def shift_of(ballot: Ballot, i: int, correction: Correction, out: Array) -> None:
+    """Write where a correction puts the displacement that the integrated motion had at vote i, d and v left out.
 
-    origin holds position and velocity that are taken off the integrated motion: what it got wrong may be large.
-    Integrated under a tilted gravity, it is off by (g - C g) t^2 / 2 beside that.
+    Integrated under a tilted gravity, the motion is off by (g - C g) t^2 / 2.
     """
-    x = votes[i, 21] - origin[0] - since * origin[3]
-    y = votes[i, 22] - origin[1] - since * origin[4]
-    z = votes[i, 23] - origin[2] - since * origin[5]
+    vote, C, origin, gravity = ballot.votes[i], correction.C, correction.origin, ballot.gravity
+    since = seconds_since(ballot, i)
+    x = vote[21] - origin[0] - since * origin[3]
+    y = vote[22] - origin[1] - since * origin[4]
+    z = vote[23] - origin[2] - since * origin[5]
     apply(C, x, y, z, out)
     for j in range(3):
         turned = C[3 * j] * gravity[0] + C[3 * j + 1] * gravity[1] + C[3 * j + 2] * gravity[2]
@@ -50,57 +50,23 @@ def shift_of(votes: Array, i: int, C: Array, origin: Array, gravity: Array, sinc
 
 
 @njit(cache=True)
-def fit_correction(
-    votes: Array,
-    stamps: Ints,
-    first: int,
-    head: int,
-    now: int,
-    up: Array,
-    origin: Array,
-    gravity: Array,
-    max_speed: float,
-    max_tilt: float,
-    C: Array,
-    d: Array,
-    v: Array,
-    agreed: Ints,
-) -> None:
-    """Improve the correction C (9,), d (3,), v (3,) by one Gauss-Newton step over the votes first..head-1.
+def fit_correction(ballot: Ballot, correction: Correction) -> None:
+    """Improve a correction by one Gauss-Newton step over the votes of which something agrees with it.
 
-    agreed (ring length) says what of each vote agrees. Gravity weighs with a third of max_tilt, and velocities beyond
-    max_speed count as unlikely. Unknowns: a turn of C on the left (rad), d (m), v (m/s).
+    Gravity weighs with a third of the start's max_tilt, and velocities beyond max_speed count as unlikely. Unknowns:
+    a turn of C on the left (rad), d (m), v (m/s).
     """
-    A, b = np.zeros((9, 9)), np.zeros(9)
-    placed, whole, mask = np.zeros(_OTHERS + 1), np.zeros(_OTHERS + 1), len(stamps) - 1
-    for a in range(first, head):
-        i = a & mask
-        owner = _owner(votes[i])
-        placed[owner] += agreed[i] != 0
-        whole[owner] += agreed[i] & WHOLE != 0
-    for a in range(first, head):
-        i = a & mask
-        if agreed[i] != 0:
-            owner, since = _owner(votes[i]), (stamps[i] - now) * 1e-9
-            _add_place(votes, i, C, d, v, origin, gravity, since, 1.0 / placed[owner], A, b)
-            if agreed[i] & WHOLE != 0:
-                _add_turn(votes[i], C, 1.0 / whole[owner], A, b)
-    _add_gravity(C, up, max_tilt, A, b)
+    A, b, turn, turned = np.zeros((9, 9)), np.zeros(9), np.zeros(9), np.zeros(9)
+    C, d, v = correction.C, correction.d, correction.v
+    _add_votes(ballot, correction, A, b)
+    _add_gravity(C, ballot.up, ballot.options[MAX_TILT], A, b)
+    weight = max(ballot.options[MAX_SPEED], 1e-3) ** -2
     for j in range(3):
         A[j, j] += _ANY_HEADING
-        A[6 + j, 6 + j] += max(max_speed, 1e-3) ** -2
-        b[6 + j] -= v[j] * max(max_speed, 1e-3) ** -2
-    L, turn, turned = np.zeros((9, 9)), np.zeros(9), np.zeros(9)
-    if not cholesky(A, 0, 9, L):
+        A[6 + j, 6 + j] += weight
+        b[6 + j] -= v[j] * weight
+    if not _solve(A, b):
         return
-    for i in range(9):
-        for j in range(i):
-            b[i] -= L[i, j] * b[j]
-        b[i] /= L[i, i]
-    for i in range(8, -1, -1):
-        for j in range(i + 1, 9):
-            b[i] -= L[j, i] * b[j]
-        b[i] /= L[i, i]
     exp_so3(b[0], b[1], b[2], turn)
     multiply(turn, C, turned)
     for i in range(9):
@@ -111,37 +77,58 @@ def fit_correction(
 
 
 @njit(cache=True)
+def _solve(A: Array, b: Array) -> bool:
+    """b <- A^-1 b for a positive definite A (9, 9); False: it is none."""
+    L = np.zeros((9, 9))
+    if not cholesky(A, 0, 9, L):
+        return False
+    for i in range(9):
+        for j in range(i):
+            b[i] -= L[i, j] * b[j]
+        b[i] /= L[i, i]
+    for i in range(8, -1, -1):
+        for j in range(i + 1, 9):
+            b[i] -= L[j, i] * b[j]
+        b[i] /= L[i, i]
+    return True
+
+
+@njit(cache=True)
+def _add_votes(ballot: Ballot, correction: Correction, A: Array, b: Array) -> None:
+    """Add what agrees of each vote: its object's place, the attitude that it saw."""
+    placed, whole, mask = np.zeros(_OTHERS + 1), np.zeros(_OTHERS + 1), len(ballot.stamps) - 1
+    for a in range(ballot.first, ballot.head):
+        agreed, owner = correction.agreed[a & mask], _owner(ballot.votes[a & mask])
+        placed[owner] += agreed != 0
+        whole[owner] += agreed & WHOLE != 0
+    for a in range(ballot.first, ballot.head):
+        agreed, owner = correction.agreed[a & mask], _owner(ballot.votes[a & mask])
+        if agreed != 0:
+            _add_place(ballot, a & mask, correction, 1.0 / placed[owner], A, b)
+        if agreed & WHOLE != 0:
+            _add_turn(ballot.votes[a & mask], correction.C, 1.0 / whole[owner], A, b)
+
+
+@njit(cache=True)
 def _owner(vote: Array) -> int:
     k = int(vote[VOTE_OBJECT])
     return k % _OTHERS if k >= 0 else _OTHERS
 
 
 @njit(cache=True)
-def _add_place(
-    votes: Array,
-    i: int,
-    C: Array,
-    d: Array,
-    v: Array,
-    origin: Array,
-    gravity: Array,
-    since: float,
-    share: float,
-    A: Array,
-    b: Array,
-) -> None:
+def _add_place(ballot: Ballot, i: int, correction: Correction, share: float, A: Array, b: Array) -> None:
     """Add that the object of vote i is at its place, C R_m arm + shift(C) + d + v t; a turn moves it by theta x q."""
     turned, arm, shift, q, r, W = np.zeros(9), np.zeros(3), np.zeros(3), np.zeros(3), np.zeros(3), np.zeros((3, 3))
-    J = np.zeros((3, 9))
-    multiply(C, votes[i, 12:21], turned)
-    apply(turned, votes[i, VOTE_ARM], votes[i, VOTE_ARM + 1], votes[i, VOTE_ARM + 2], arm)
-    shift_of(votes, i, C, origin, gravity, since, shift)
+    J, vote, since = np.zeros((3, 9)), ballot.votes[i], seconds_since(ballot, i)
+    multiply(correction.C, vote[12:21], turned)
+    apply(turned, vote[VOTE_ARM], vote[VOTE_ARM + 1], vote[VOTE_ARM + 2], arm)
+    shift_of(ballot, i, correction, shift)
     for j in range(3):
-        q[j] = arm[j] + shift[j] - 0.5 * gravity[j] * since * since
-        r[j] = votes[i, VOTE_PLACE + j] - arm[j] - shift[j] - d[j] - v[j] * since
+        q[j] = arm[j] + shift[j] - 0.5 * ballot.gravity[j] * since * since
+        r[j] = vote[VOTE_PLACE + j] - arm[j] - shift[j] - correction.d[j] - correction.v[j] * since
         J[j, 3 + j], J[j, 6 + j] = 1.0, since
     J[0, 1], J[0, 2], J[1, 0], J[1, 2], J[2, 0], J[2, 1] = q[2], -q[1], -q[2], q[0], q[1], -q[0]
-    across, along = share / max(votes[i, VOTE_ACROSS], _EXACT), share / max(votes[i, VOTE_ALONG], _EXACT)
+    across, along = share / max(vote[VOTE_ACROSS], _EXACT), share / max(vote[VOTE_ALONG], _EXACT)
     squared = arm[0] ** 2 + arm[1] ** 2 + arm[2] ** 2
     for j in range(3):
         for k in range(3):

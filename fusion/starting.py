@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import math
 
-from fusion.compiled import njit
-from fusion.consensus import (
+from fusion.ballot import (
     GIVEN_POSE,
     IS_GIVEN,
     LONGEST_WINDOW_S,
@@ -19,10 +18,11 @@ from fusion.consensus import (
     MIN_VOTES,
     START_MIN_SPAN_S,
     START_WINDOW_S,
-    has_rival,
-    largest_agreement,
-    objects_seen,
+    Ballot,
+    agreed_correction,
 )
+from fusion.compiled import njit
+from fusion.consensus import has_rival, largest_agreement, objects_seen
 from fusion.eskf import POSITION_ONLY
 from fusion.measurements import OBJECT_POSE
 from fusion.meeting import forget_rivals
@@ -167,7 +167,7 @@ def _first_vote(m: Memory, window_s: float, wanted: int) -> int:
 
 @njit(cache=True)
 def _agreement(m: Memory, w: Work, first: int, by_places: bool) -> tuple[int, float, int, int]:
-    """Return what `largest_agreement` says of the votes since `first`; leave their correction in w.step[96:117].
+    """Return what `largest_agreement` says of the votes since `first`, and leave it the agreed correction.
 
     The integrated velocity may be right (the votes jump) or wrong (there were none for long), so both are tried.
     """
@@ -180,46 +180,26 @@ def _agreement(m: Memory, w: Work, first: int, by_places: bool) -> tuple[int, fl
 def _agreement_beside(
     m: Memory, w: Work, first: int, share_of_velocity: float, by_places: bool
 ) -> tuple[int, float, int, int]:
-    C, d, v, origin = w.step[96:105], w.step[105:108], w.step[108:111], w.step[111:117]
+    agreed = agreed_correction(m, w)
     for i in range(3):
-        origin[i] = m.x[POSITION + i]
-        origin[3 + i] = share_of_velocity * m.x[VELOCITY + i]
-    return largest_agreement(
-        m.votes,
-        m.vote_stamps,
-        first,
-        m.counters[VOTE_HEAD],
-        m.counters[NOW],
-        _up(m, w),
-        origin,
-        m.x[GRAVITY : GRAVITY + 3],
-        m.start,
-        C,
-        d,
-        v,
-        by_places,
-        m.inliers,
-        w.step,
-    )
+        agreed.origin[i] = m.x[POSITION + i]
+        agreed.origin[3 + i] = share_of_velocity * m.x[VELOCITY + i]
+    return largest_agreement(_ballot(m, w, first), agreed, by_places)
 
 
 @njit(cache=True, _nrt=True)
-def _up(m: Memory, w: Work) -> Array:
-    """Return where the integrated motion has up; zero where nothing feels it."""
-    up = w.step[150:153]
+def _ballot(m: Memory, w: Work, first: int) -> Ballot:
+    """Return the votes since `first`."""
+    up, gravity = w.step[150:153], m.x[GRAVITY : GRAVITY + 3]
     for i in range(3):
         up[i] = m.up[i] if m.start[MAX_TILT] < math.pi else 0.0
-    return up
+    return Ballot(m.votes, m.vote_stamps, first, m.counters[VOTE_HEAD], m.counters[NOW], up, gravity, m.start, w.step)
 
 
 @njit(cache=True)
 def _is_contested(m: Memory, w: Work, first: int) -> bool:
     """Tell whether the agreement that was found has a rival."""
-    C, d, v, origin = w.step[96:105], w.step[105:108], w.step[108:111], w.step[111:117]
-    g, newest, up = m.x[GRAVITY : GRAVITY + 3], m.counters[VOTE_HEAD], _up(m, w)
-    return has_rival(
-        m.votes, m.vote_stamps, first, newest, m.counters[NOW], up, origin, g, m.start, C, d, v, m.inliers, w.step
-    )
+    return has_rival(_ballot(m, w, first), agreed_correction(m, w))
 
 
 @njit(cache=True)
@@ -236,22 +216,22 @@ def try_to_start(m: Memory, w: Work) -> None:
 @njit(cache=True)
 def _agree_with_given_pose(m: Memory, w: Work) -> None:
     """Write the correction that takes the state to the given pose, standing still, as `_agreement` does."""
-    at = GIVEN_POSE
-    multiply_transposed_right(m.start[at : at + 9], m.x[0:9], w.step[96:105])
+    agreed, at = agreed_correction(m, w), GIVEN_POSE
+    multiply_transposed_right(m.start[at : at + 9], m.x[0:9], agreed.C)
     for i in range(3):
-        w.step[105 + i], w.step[108 + i] = m.start[at + 9 + i], 0.0
-        w.step[111 + i], w.step[114 + i] = m.x[POSITION + i], m.x[VELOCITY + i]
-    m.inliers[:] = 0
+        agreed.d[i], agreed.v[i] = m.start[at + 9 + i], 0.0
+        agreed.origin[i], agreed.origin[3 + i] = m.x[POSITION + i], m.x[VELOCITY + i]
+    agreed.agreed[:] = 0
 
 
 @njit(cache=True)
 def _found_by_votes(m: Memory, w: Work) -> bool:
-    """Tell whether enough votes agree and have no rival; leave their correction in w.step[96:117]."""
+    """Tell whether enough votes agree and have no rival; leave their correction to `adopt`."""
     first = _first_vote(m, m.start[START_WINDOW_S], 2 * int(m.start[MIN_VOTES]))
     count, span, objects, alike = _agreement(m, w, first, False)
     total = m.counters[VOTE_HEAD] - first
     if count < max(m.start[MIN_VOTES], m.start[MIN_SHARE] * total):
-        if objects_seen(m.votes, first, m.counters[VOTE_HEAD]) < m.start[MIN_OBJECTS] or m.start[MAX_TILT] >= math.pi:
+        if objects_seen(_ballot(m, w, first)) < m.start[MIN_OBJECTS] or m.start[MAX_TILT] >= math.pi:
             return False
         count, span, objects, alike = _agreement(m, w, first, True)
         if objects < m.start[MIN_OBJECTS] or count < max(m.start[MIN_VOTES], m.start[MIN_PLACES] * total):
@@ -288,15 +268,16 @@ def adopt(m: Memory, w: Work, keep_from: int) -> None:
     """Move the state to the agreed pose; error states before keep_from (all where 0) and object biases start anew."""
     if len(m.tape) > 0:
         note_restart(m, keep_from)
-    C, d, v, origin, turned = w.step[96:105], w.step[105:108], w.step[108:111], w.step[111:117], w.step[0:9]
+    agreed, turned = agreed_correction(m, w), w.step[0:9]
+    C, origin = agreed.C, agreed.origin
     multiply(C, m.x[0:9], turned)
     for i in range(9):
         m.x[i] = turned[i]
     kept = w.step[9:12]
     apply(C, m.x[VELOCITY] - origin[3], m.x[VELOCITY + 1] - origin[4], m.x[VELOCITY + 2] - origin[5], kept)
     for i in range(3):
-        m.x[POSITION + i] = d[i]
-        m.x[VELOCITY + i] = kept[i] + v[i]
+        m.x[POSITION + i] = agreed.d[i]
+        m.x[VELOCITY + i] = kept[i] + agreed.v[i]
     n = m.layout[N_ERROR]
     at = m.layout[AT_BIASES]
     biases = 6 * m.layout[N_OBJECTS] * m.layout[N_BIAS_KINDS]

@@ -7,7 +7,9 @@ import pytest
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
-from fusion.start_fit import WHOLE, fit_correction
+from fusion import ballot
+from fusion.ballot import CORRECTION_SIZE, GIVEN_POSE, WHOLE, Ballot, correction_in
+from fusion.start_fit import fit_correction
 from fusion.votes import (
     VOTE_ACROSS,
     VOTE_ALONG,
@@ -53,11 +55,15 @@ def votes_of(truth, objects, seed=0, frames=12, turned=None, noise=0.0):
 
 
 def fitted(votes, stamps, n, start, steps=8):
-    C, d, v = Rotation.from_rotvec(start[:3]).as_matrix().ravel(), start[3:6].copy(), start[6:].copy()
-    agreed = np.full(len(stamps), WHOLE)
+    options = np.zeros(GIVEN_POSE)
+    options[ballot.MAX_SPEED], options[ballot.MAX_TILT] = MAX_SPEED, MAX_TILT
+    cast = Ballot(votes, stamps, 0, n, 0, UP, GRAVITY, options, np.zeros(256))
+    correction = correction_in(np.zeros(CORRECTION_SIZE), np.full(len(stamps), WHOLE))
+    correction.C[:] = Rotation.from_rotvec(start[:3]).as_matrix().ravel()
+    correction.d[:], correction.v[:] = start[3:6], start[6:]
     for _ in range(steps):
-        fit_correction(votes, stamps, 0, n, 0, UP, np.zeros(6), GRAVITY, MAX_SPEED, MAX_TILT, C, d, v, agreed)
-    return np.r_[Rotation.from_matrix(C.reshape(3, 3)).as_rotvec(), d, v]
+        fit_correction(cast, correction)
+    return np.r_[Rotation.from_matrix(correction.C.reshape(3, 3)).as_rotvec(), correction.d, correction.v]
 
 
 def cost(votes, stamps, n):
