@@ -23,6 +23,7 @@ COMMANDS = {
     "run": "localise in all modes, fuse with all estimators, evaluate, draw and record",
     "detect": "images, a video or a log become object poses with covariances",
     "train": "a pose network from images with poses",
+    "train-refiner": "a refiner for a trained pose network, from images with poses and the objects' models",
     "calibrate": "scale a network's variances until held-out errors agree with them",
     "ablation": "what each part of the pose network is worth: the paper's rows and ours, equally trained",
     "export": "write a pose network as ONNX or OpenVINO",

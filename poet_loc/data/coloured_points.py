@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import cv2
@@ -9,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from poet_loc.core.input_error import InputError
-from poet_loc.io.bop_models import read_models_info
+from poet_loc.io.bop_models import models_of
 from poet_loc.io.ply import ColouredMesh, read_coloured_mesh
 
 Array = NDArray[np.float64]
@@ -21,20 +22,21 @@ _BLUR = 9
 _GRAY = 128
 
 
-def coloured_points(folder: Path, count: int) -> tuple[Array, Bytes, Array]:
-    """Return points (C, count, 3) m, colours (C, count, 3) RGB and diameters (C,) m of a models folder.
+def coloured_points(folder: Path, count: int, object_ids: Sequence[int] = ()) -> tuple[Array, Bytes, Array]:
+    """Return points (C, count, 3) m, colours (C, count, 3) RGB and diameters (C,) m of a models folder's objects.
 
+    In the order that is named, else all by number.
     Points are spread evenly over each surface; colours are those of texture or vertices, gray where there are none.
     The same folder gives the same points.  Raises InputError for what cannot be read.
     """
-    info = read_models_info(folder / "models_info.json")
+    info = models_of(folder / "models_info.json", object_ids)
     points, colours = [], []
-    for number in sorted(info):
+    for number in info:
         mesh = read_coloured_mesh(folder / f"obj_{number:06d}.ply")
         corners, shares = spread_over(mesh.vertices, mesh.triangles, count, np.random.default_rng(number))
         points.append(blend(mesh.vertices, corners, shares))
         colours.append(_colours(mesh, corners, shares))
-    return np.stack(points), np.stack(colours), np.array([info[number].diameter_m for number in sorted(info)])
+    return np.stack(points), np.stack(colours), np.array([model.diameter_m for model in info.values()])
 
 
 def spread_over(

@@ -1,4 +1,4 @@
-"""BOP scenes packed for quick training: JPEGs in one piece, half-size depth and instance maps, and exact augmentation.
+"""BOP scenes packed for quick training: image files in one piece, half-size depth and instances, exact augmentation.
 
 Turning the camera about its optical axis, zooming and shifting the image are all one homography K' R K^-1 that changes
 the poses exactly, so the augmented image is one that a real camera could have taken.
@@ -6,6 +6,7 @@ the poses exactly, so the augmented image is one that a real camera could have t
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,9 +16,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from poet_loc.core.input_error import InputError
+from poet_loc.data.bop_dataset import image_path
 from poet_loc.data.coloured_points import blend, spread_over
-from poet_loc.io.bop import read_bop_scene
-from poet_loc.io.bop_models import read_models_info
+from poet_loc.io.bop import BopAnnotations, BopScene, read_bop_scene
+from poet_loc.io.bop_models import models_of
 from poet_loc.io.ply import read_model_mesh
 
 Array = NDArray[np.float64]
@@ -38,6 +40,13 @@ class ObjectModels:
     """(C,) m."""
     symmetry_axes: Array
     """(C, 3) axis of a continuous symmetry, zero where there is none."""
+    object_ids: tuple[int, ...]
+    """(C,) BOP's number of classes 1..C."""
+
+    def classes_of(self, object_ids: NDArray[np.int64]) -> NDArray[np.int64]:
+        """Return the class of each object, 0 where it is none of these."""
+        class_of = {number: label for label, number in enumerate(self.object_ids, start=1)}
+        return np.array([class_of.get(number, 0) for number in object_ids.tolist()], np.int64)
 
 
 @dataclass(frozen=True)
@@ -48,14 +57,15 @@ class PackedScene:
     jpeg_starts: NDArray[np.int64]
     """(N + 1,)"""
     depth: NDArray[np.uint16]
-    """(N, h, w) 0.1 mm; 0: nothing."""
+    """(N, h, w) 0.1 mm; 0: nothing. (N, 0, 0) where it was packed without."""
     instance: NDArray[np.uint8]
-    """(N, h, w) row of the object in the image, plus 1; 0: none."""
+    """(N, h, w) row of the object in the image, plus 1; 0: none. (N, 0, 0) likewise."""
     intrinsics: Array
     """(N, 4)"""
     object_starts: NDArray[np.int64]
     """(N + 1,) rows of image n are [n]:[n + 1]."""
-    classes: NDArray[np.int64]
+    object_ids: NDArray[np.int64]
+    """(M,)"""
     poses: Array
     """(M, 3, 4) T_cam_obj, m."""
     visible: Array
@@ -91,51 +101,42 @@ class Sample:
     """(3, 3) from the camera axes of the packed image to those of this one."""
 
 
-def load_models(folder: Path, count: int = 400) -> ObjectModels:
-    """Read a BOP models folder; classes must be numbered 1..C.  Raises InputError for what does not fit."""
-    info = read_models_info(folder / "models_info.json")
-    ids = sorted(info)
-    if ids != list(range(1, len(ids) + 1)):
-        raise InputError(f"objects {ids} are not numbered 1..{len(ids)}", path=folder / "models_info.json")
-    points, surface, axes = [], [], np.zeros((len(ids), 3))
-    for number in ids:
+def load_models(folder: Path, object_ids: Sequence[int] = (), count: int = 400) -> ObjectModels:
+    """Read a BOP models folder; class k is the k-th of these objects, of all that are there if none is named.
+
+    Raises InputError for what cannot be read.
+    """
+    info = models_of(folder / "models_info.json", object_ids)
+    points, surface, axes = [], [], np.zeros((len(info), 3))
+    for label, (number, model) in enumerate(info.items()):
         vertices, faces = read_model_mesh(folder / f"obj_{number:06d}.ply")
         surface.append(blend(vertices, *spread_over(vertices, faces, 1000, np.random.default_rng(number))))
         points.append(vertices[np.linspace(0, len(vertices) - 1, count).astype(int)])
-        symmetry = info[number].symmetry
-        if symmetry is not None and symmetry.order == "continuous":
-            axes[number - 1] = symmetry.axis
-    diameters = np.array([info[number].diameter_m for number in ids])
-    return ObjectModels(np.stack(points), np.stack(surface), diameters, axes)
+        if model.symmetry is not None and model.symmetry.order == "continuous":
+            axes[label] = model.symmetry.axis
+    diameters = np.array([model.diameter_m for model in info.values()])
+    return ObjectModels(np.stack(points), np.stack(surface), diameters, axes, tuple(info))
 
 
-def pack_scene(scene: Path, out: Path) -> None:
-    """Pack a BOP scene folder (rgb/*.jpg, depth, mask_visib, JSON) into out, unless it is there."""
+def pack_scene(scene: Path, out: Path, with_depth: bool = True) -> None:
+    """Pack a BOP scene folder (images, JSON; depth and mask_visib where asked for) into out, unless it is there."""
     if out.exists():
         return
     read = read_bop_scene(scene)
     found = read.annotations
-    if found is None or found.visible_fractions is None or read.depth_scales is None:
-        raise InputError("has no scene_gt_info.json or no depth scale", path=scene, fix="give a complete BOP scene")
-    jpegs, depths, instances, starts = [], [], [], [0]
-    for image, scale in zip(read.image_ids.tolist(), read.depth_scales / 0.1):
-        jpegs.append(np.fromfile(scene / "rgb" / f"{image:06d}.jpg", np.uint8))
-        depth = _read(scene / "depth" / f"{image:06d}.png", cv2.IMREAD_UNCHANGED)[::SHRINK, ::SHRINK]
-        instance = np.zeros(depth.shape, np.uint8)
-        count = int((found.image_ids == image).sum())
-        for row in range(count):
-            mask = _read(scene / "mask_visib" / f"{image:06d}_{row:06d}.png", cv2.IMREAD_GRAYSCALE)
-            instance[mask[::SHRINK, ::SHRINK] > 0] = row + 1
-        depths.append(np.minimum(depth * scale, 65535).astype(np.uint16))
-        instances.append(instance)
-        starts.append(starts[-1] + count)
+    if found is None or found.visible_fractions is None:
+        raise InputError("has no scene_gt_info.json", path=scene, fix="give a complete BOP scene")
+    counts = [int((found.image_ids == image).sum()) for image in read.image_ids]
+    coded = [np.fromfile(_image_of(scene, image), np.uint8) for image in read.image_ids.tolist()]
+    nothing = np.zeros((len(read), 0, 0))
+    depth, instance = _depth_and_instances(scene, read, found) if with_depth else (nothing, nothing)
     arrays = {
-        "jpegs": np.concatenate(jpegs),
-        "jpeg_starts": np.cumsum([0] + [len(jpeg) for jpeg in jpegs]),
-        "depth": np.stack(depths),
-        "instance": np.stack(instances),
+        "jpegs": np.concatenate(coded),
+        "jpeg_starts": np.cumsum([0] + [len(file) for file in coded]),
+        "depth": depth.astype(np.uint16),
+        "instance": instance.astype(np.uint8),
         "intrinsics": read.camera_matrices[:, [0, 1, 0, 1], [0, 1, 2, 2]],
-        "object_starts": np.array(starts),
+        "object_starts": np.cumsum([0, *counts]),
         "classes": found.object_ids,
         "poses": found.T_cam_obj.as_matrix()[:, :3],
         "visible": found.visible_fractions,
@@ -145,6 +146,29 @@ def pack_scene(scene: Path, out: Path) -> None:
     for name, array in arrays.items():
         np.save(partial / f"{name}.npy", array)
     partial.rename(out)
+
+
+def _image_of(scene: Path, image: int) -> Path:
+    path = image_path(scene, image)
+    if path is None:
+        raise InputError(f"image {image:06d} is missing", path=scene, fix="it belongs into rgb/ or gray/")
+    return path
+
+
+def _depth_and_instances(scene: Path, read: BopScene, found: BopAnnotations) -> tuple[NDArray, NDArray]:
+    """Return depth (N, h, w), 0.1 mm, and instances (N, h, w)."""
+    if read.depth_scales is None:
+        raise InputError("has no depth scale", path=scene, fix="give a complete BOP scene")
+    depths, instances = [], []
+    for image, scale in zip(read.image_ids.tolist(), read.depth_scales / 0.1):
+        depth = _read(scene / "depth" / f"{image:06d}.png", cv2.IMREAD_UNCHANGED)[::SHRINK, ::SHRINK]
+        instance = np.zeros(depth.shape, np.uint8)
+        for row in range(int((found.image_ids == image).sum())):
+            mask = _read(scene / "mask_visib" / f"{image:06d}_{row:06d}.png", cv2.IMREAD_GRAYSCALE)
+            instance[mask[::SHRINK, ::SHRINK] > 0] = row + 1
+        depths.append(np.minimum(depth * scale, 65535))
+        instances.append(instance)
+    return np.stack(depths), np.stack(instances)
 
 
 def _read(path: Path, flags: int) -> NDArray:
@@ -184,15 +208,27 @@ class PackedImages:
     """All packed scenes of a folder as one row of samples."""
 
     def __init__(
-        self, scenes: list[Path], models: ObjectModels, stride: int | None = 8, least_visible: float = 0.1
+        self,
+        scenes: list[Path],
+        models: ObjectModels,
+        stride: int | None = 8,
+        least_visible: float = 0.1,
+        most: int | None = None,
     ) -> None:
-        """stride: pixels per cell of the samples' object coordinates, None: they have none."""
+        """stride: pixels per cell of the samples' object coordinates, None: they have none.
+
+        most: so many images at most, evenly spread over all.
+        """
         if not scenes:
             raise InputError("there is no packed scene to train on", fix="render and pack first")
         self.scenes = [open_packed(scene) for scene in scenes]
+        if stride is not None and not all(scene.instance.size for scene in self.scenes):
+            raise InputError("is packed without depth and masks", path=scenes[0], fix="name another cache folder")
         self.models, self.stride, self.least_visible = models, stride, least_visible
         counts = [len(scene) for scene in self.scenes]
-        self.index = [(s, n) for s, count in enumerate(counts) for n in range(count)]
+        index = [(s, n) for s, count in enumerate(counts) for n in range(count)]
+        count = len(index) if most is None else min(most, len(index))
+        self.index = [index[place] for place in np.linspace(0, len(index) - 1, count).round().astype(int)]
 
     def __len__(self) -> int:
         return len(self.index)
@@ -205,7 +241,8 @@ class PackedImages:
         height, width = image.shape[:2]
         K, K_new, R_turn = _random_camera(scene.intrinsics[n], width, rng, augment)
         rows = slice(scene.object_starts[n], scene.object_starts[n + 1])
-        poses, classes, visible = scene.poses[rows], scene.classes[rows], scene.visible[rows]
+        poses, visible = scene.poses[rows], scene.visible[rows]
+        classes = self.models.classes_of(scene.object_ids[rows])
         warp = K_new @ R_turn @ np.linalg.inv(K)
         R_old, t_old = poses[:, :, :3], poses[:, :, 3]
         surface = np.zeros((0, 0, 3))
@@ -217,10 +254,10 @@ class PackedImages:
                 cv2.warpPerspective(image, warp, (width, height), borderMode=cv2.BORDER_REFLECT), rng, augment
             )
         R, t = R_turn @ R_old, t_old @ R_turn.T
-        whole = self._boxes(R, t, classes, K_new)
+        whole = self._boxes(R, t, np.maximum(classes, 1), K_new)
         boxes = np.clip(whole, 0.0, [width, height, width, height])
         size, whole_size = boxes[:, 2:] - boxes[:, :2], whole[:, 2:] - whole[:, :2]
-        keep = (visible >= self.least_visible) & (size.min(1) > 6.0) & (t[:, 2] > 0.1)
+        keep = (classes > 0) & (visible >= self.least_visible) & (size.min(1) > 6.0) & (t[:, 2] > 0.1)
         keep &= size.prod(1) > 0.2 * whole_size.prod(1)  # turned or shifted out of the image
         flat = np.array([K_new[0, 0], K_new[1, 1], K_new[0, 2], K_new[1, 2]])
         return Sample(
@@ -247,13 +284,13 @@ class PackedImages:
         x, y = np.where(inside, x, 0), np.where(inside, y, 0)
         row = np.where(inside, instance[y, x], 0).astype(int) - 1
         surface = np.full(old.shape, np.nan)
-        hit = row >= 0
+        hit = (row >= 0) & (np.append(classes, 0)[row] > 0)
         if hit.any():
             z = depth[y[hit], x[hit]] * 1e-4
             ray = np.stack(
                 [(x[hit] * SHRINK - K[0, 2]) / K[0, 0], (y[hit] * SHRINK - K[1, 2]) / K[1, 1], np.ones(len(z))], -1
             )
-            turned = canonical_rotation(R, t, self.models.symmetry_axes[classes - 1])
+            turned = canonical_rotation(R, t, self.models.symmetry_axes[np.maximum(classes, 1) - 1])
             point = np.einsum("ni,nij->nj", ray * z[:, None] - t[row[hit]], turned[row[hit]])
             surface[hit] = point / self.models.diameters[classes[row[hit]] - 1, None]
         return surface
@@ -304,10 +341,18 @@ def _shake_colors(image: NDArray, rng: np.random.Generator, augment: AugmentOpti
     return np.asarray(changed, np.uint8)
 
 
-def pack(split: Path, out: Path, jobs: int = 2) -> list[Path]:
+def scenes_of(split: Path) -> list[Path]:
+    """Return a BOP split's whole scenes in order.  Raises InputError where there is none."""
+    folders = sorted(split.iterdir()) if split.is_dir() else []
+    scenes = [path for path in folders if path.suffix != ".partial" and (path / "scene_gt.json").exists()]
+    if not scenes:
+        raise InputError("no BOP split: it has no folders like 000001 with scene_gt.json", path=split)
+    return scenes
+
+
+def pack(split: Path, out: Path, jobs: int = 2, with_depth: bool = True) -> list[Path]:
     """Pack every whole scene of a BOP split that is not packed yet and return the packed folders in order."""
-    scenes = sorted(path for path in split.iterdir() if path.is_dir() and (path / "scene_gt.json").exists())
-    scenes = [scene for scene in scenes if scene.suffix != ".partial"]
+    scenes = scenes_of(split)
     with ThreadPoolExecutor(jobs) as pool:
-        list(pool.map(lambda scene: pack_scene(scene, out / scene.name), scenes))
+        list(pool.map(lambda scene: pack_scene(scene, out / scene.name, with_depth), scenes))
     return [out / scene.name for scene in scenes]

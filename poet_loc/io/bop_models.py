@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import warnings
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -65,6 +65,18 @@ def read_models_info(path: str | Path) -> dict[int, BopModel]:
             line = line_of(read_text(path), rf'"{key}"\s*:')
             raise InputError(what, path=path, line=line, fix="write it as the BOP format wants it") from None
     return models
+
+
+def models_of(path: str | Path, object_ids: Sequence[int]) -> dict[int, BopModel]:
+    """Read the models of these objects in this order, all by number where none is named.
+
+    Raises InputError for a malformed file, and where an object is missing.
+    """
+    models = read_models_info(path)
+    missing = [str(number) for number in object_ids if number not in models]
+    if missing:
+        raise InputError(f"has no model of object {', '.join(missing)}", path=path, fix="give the objects' own models")
+    return {number: models[number] for number in object_ids or sorted(models)}
 
 
 def write_models_info(path: str | Path, models: Mapping[int, BopModel]) -> None:

@@ -7,12 +7,17 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from poet_loc.data.packed import PackedImages
 from poet_loc.model.poet import PoET
+from poet_loc.train.embedded import Boxes, pose_errors, predict
 
 Array = NDArray[np.float64]
 
 ONE_SIGMA = 0.6827
 """Share of a Gaussian within one sigma."""
+BOXES: tuple[Boxes, ...] = ("bb", "gt")
+
+_LEAST_DETECTED = 100  # a detector that finds less has learned nothing yet: the true boxes then stand in for its own
 
 
 def temperatures(error: Array, log_variance: Array) -> Array:
@@ -43,3 +48,28 @@ def scale_sigmas(network: PoET, factors: Array) -> None:
     for name, part in (("translation_head_aleatoric", shift[:3]), ("rotation_head_aleatoric", shift[3:])):
         bias: Tensor = network.get_parameter(f"{name}.{network.options.decoder_layers - 1}.layers.2.bias")
         bias += part.repeat(network.options.slots)
+
+
+def calibrate(network: PoET, images: PackedImages) -> dict[str, object]:
+    """Scale a network's sigmas until those of images that it has not seen agree with the errors; tell what was found.
+
+    For the detector's boxes, since those are what a log brings.
+    """
+    seen = {kind: _errors(network.float(), images, kind) for kind in BOXES}
+    used: Boxes = "bb" if len(seen["bb"][0]) >= _LEAST_DETECTED else "gt"
+    factors = temperatures(*seen[used])
+    assert np.all(np.isfinite(factors))
+    scale_sigmas(network, factors)
+    inside = {kind: coverage(e, s + 2.0 * np.log(factors)) for kind, (e, s) in seen.items() if len(e)}
+    return {
+        "images": len(images),
+        "calibrated_for": used,
+        "temperatures": [round(float(value), 4) for value in factors],
+        "coverage": {kind: [round(float(share), 3) for share in shares] for kind, shares in inside.items()},
+    }
+
+
+def _errors(network: PoET, images: PackedImages, boxes: Boxes) -> tuple[Array, Array]:
+    """Return (K, 6) errors and log variances."""
+    t, R, log_variance, truth = predict(network, images, len(images), images.models, boxes)
+    return pose_errors(t, R, truth).double().numpy(), log_variance.double().numpy()

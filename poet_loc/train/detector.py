@@ -32,10 +32,10 @@ class DetectorTargets:
     """(B, 1, h, w)"""
 
 
-def image_batch(samples: list[Sample]) -> ImageBatch:
-    """Return the samples' images as the network wants them, padded to multiples of 16."""
+def image_batch(samples: list[Sample], multiple: int = 16) -> ImageBatch:
+    """Return the samples' images as the network wants them, padded to multiples (px)."""
     images = [torch.from_numpy(sample.image).permute(2, 0, 1).float() / 255.0 for sample in samples]
-    return batch_images(images, torch.from_numpy(np.stack([sample.intrinsics for sample in samples])).float(), 16)
+    return batch_images(images, torch.from_numpy(np.stack([sample.intrinsics for sample in samples])).float(), multiple)
 
 
 def targets_of(samples: list[Sample], size: tuple[int, int], class_count: int) -> DetectorTargets:

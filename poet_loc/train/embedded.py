@@ -13,6 +13,7 @@ from torch import Tensor, nn
 
 from poet_loc.core.object_errors import add_s, area_under_curve
 from poet_loc.data.packed import AugmentOptions, ObjectModels, PackedImages, Sample, load_models, pack
+from poet_loc.model.heads import rotation_matrices
 from poet_loc.model.losses import rotation_vector
 from poet_loc.model.options import NetworkOptions
 from poet_loc.model.poet import PoET, PoseOutput
@@ -259,7 +260,7 @@ def predict(
         samples = [
             images.sample(n, np.random.default_rng(0)) for n in range(start, min(start + 10, count, len(images)))
         ]
-        batch = image_batch(samples)
+        batch = image_batch(samples, module.detector.shape().multiple)
         features, limit = module.extract(batch), module.options.queries
         queries, truth = queries_and_truth(samples, [s.boxes for s in samples], batch.size, limit, models)
         image, query = torch.nonzero(real_queries(queries), as_tuple=True)
@@ -271,7 +272,8 @@ def predict(
         parts = (output.translation_uncertainty, output.rotation_uncertainty)
         known = [part[image, query] for part in parts if part is not None]
         s = torch.cat(known, 1) if len(known) == 2 else torch.zeros(len(truth.t), 6)
-        rows.append((output.translation[image, query], output.rotation[image, query], s, *truth.columns))
+        R = rotation_matrices(output.rotation[image, query])
+        rows.append((output.translation[image, query], R, s, *truth.columns))
     joined = [torch.cat(column) for column in zip(*rows)]
     return joined[0], joined[1], joined[2], Truth(*joined[3:])
 

@@ -7,23 +7,20 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
-import numpy as np
 import torch
-from numpy.typing import NDArray
 
-from poet_loc.data.packed import ObjectModels, PackedImages, load_models, pack
+from poet_loc.data.packed import PackedImages, load_models, pack
 from poet_loc.model.checkpoint import ModelConfig, save_model
 from poet_loc.model.poet import PoET
 from poet_loc.model.small_detector import SmallDetector, SmallDetectorOptions
-from poet_loc.train.calibration import coverage, scale_sigmas, temperatures
+from poet_loc.train.add_refiner import AddRefinerOptions
+from poet_loc.train.calibration import calibrate
 from poet_loc.train.detector import TrainDetectorOptions, train_detector
-from poet_loc.train.embedded import EMBEDDED, Boxes, TrainEmbeddedOptions, pose_errors, predict, train_embedded
+from poet_loc.train.embedded import EMBEDDED, TrainEmbeddedOptions, train_embedded
 from poet_loc.train.optimizer import OptimizerKind
 from poet_loc.train.refiner import TrainRefinerOptions, train_refiner
-from poet_loc.train.steps import StepOptions
+from poet_loc.train.steps import Precision, StepOptions, last_row
 
-Array = NDArray[np.float64]
-BOXES: tuple[Boxes, ...] = ("bb", "gt")
 Stage = Literal["detector", "joint", "refiner"]
 STAGES: tuple[Stage, ...] = ("detector", "joint", "refiner")
 
@@ -42,13 +39,13 @@ class EmbeddedPresetOptions:
     """Steps of the detector alone, before the pose network joins."""
     joint_steps: int = 15500
     """Steps of detector and pose network together."""
-    refiner_steps: int = 4000
+    refiner_steps: int = AddRefinerOptions.steps
     """Steps of the refiner, once the pose network has done all of its own."""
     batch: int = 16
     """Images per step."""
     seed: int = 0
     """Seed of data and weights."""
-    precision: str = "auto"
+    precision: Precision = StepOptions.precision
     """auto: bfloat16 where the CPU has matrix units for it, else float32."""
     max_steps: int | None = None
     """Stop, resumable, after so many steps of each stage in this stretch."""
@@ -71,7 +68,8 @@ def train_preset(options: EmbeddedPresetOptions) -> Path:
     detector.load_state_dict(torch.load(options.out / "detector" / "checkpoint.pt", weights_only=True)["module"])
     network = train_embedded(TrainEmbeddedOptions(world, cache, _steps(options, "joint"), fine_tune=True), detector)
     if _done(options.out / "joint") >= options.joint_steps:
-        refiner = train_refiner(TrainRefinerOptions(world, cache, _steps(options, "refiner")), network)
+        asked = TrainRefinerOptions(world / "train", world / "val", world / "models", cache, _steps(options, "refiner"))
+        refiner = train_refiner(asked, network)
         if _done(options.out / "refiner") >= options.refiner_steps:
             network.refiner = refiner
     return finish(network, world, cache, options.out / "embedded.safetensors", history(options.out))
@@ -81,7 +79,7 @@ def _steps(options: EmbeddedPresetOptions, stage: Stage) -> StepOptions:
     stages: dict[Stage, tuple[int, float, OptimizerKind]] = {
         "detector": (options.detector_steps, 1e-3, "adamw"),
         "joint": (options.joint_steps, 7e-4, "muon"),
-        "refiner": (options.refiner_steps, 1.5e-3, "muon"),
+        "refiner": (options.refiner_steps, AddRefinerOptions.learning_rate, "muon"),
     }
     count, rate, kind = stages[stage]
     return StepOptions(
@@ -97,18 +95,12 @@ def _steps(options: EmbeddedPresetOptions, stage: Stage) -> StepOptions:
 
 
 def _done(stage: Path) -> float:
-    return _last_row(stage).get("step", 0.0)
-
-
-def _last_row(stage: Path) -> dict[str, float]:
-    path = stage / "log.jsonl"
-    rows = path.read_text().splitlines() if path.exists() else []
-    return dict(json.loads(rows[-1])) if rows else {}
+    return last_row(stage).get("step", 0.0)
 
 
 def history(folder: Path) -> dict[str, object]:
     """Return what a run's logs say about its length, for the record in the checkpoint."""
-    last = {stage: _last_row(folder / stage) for stage in STAGES}
+    last = {stage: last_row(folder / stage) for stage in STAGES}
     told: dict[str, object] = {
         stage: {key: row[key] for key in ("step", "cpu_minutes")} for stage, row in last.items() if row
     }
@@ -117,13 +109,8 @@ def history(folder: Path) -> dict[str, object]:
 
 def finish(network: PoET, world: Path, cache: Path, out: Path, source: dict[str, object]) -> Path:
     """Calibrate a network on the validation images, for the detector's boxes, and write it in half precision."""
-    models = load_models(world / "models")
-    val = PackedImages(pack(world / "val", cache / "val"), models)
-    seen = {kind: _errors(network.float(), val, models, kind) for kind in BOXES}
-    used: Boxes = "bb" if len(seen["bb"][0]) >= _LEAST_DETECTED else "gt"
-    factors = temperatures(*seen[used])
-    scale_sigmas(network, factors)
-    inside = {kind: coverage(e, s + 2.0 * np.log(factors)) for kind, (e, s) in seen.items() if len(e)}
+    val = PackedImages(pack(world / "val", cache / "val"), load_models(world / "models"))
+    found = calibrate(network, val)
     names = json.loads((world / "models" / "names.json").read_text())
     ids = tuple(sorted(int(key) for key in names))
     detector = network.detector
@@ -135,23 +122,7 @@ def finish(network: PoET, world: Path, cache: Path, out: Path, source: dict[str,
         tuple(names[str(number)] for number in ids),
         image_size=(320, 240),
         refiner=None if network.refiner is None else network.refiner.options,
-        source={
-            **source,
-            "images": len(val),
-            "calibrated_for": used,
-            "temperatures": [round(float(value), 4) for value in factors],
-            "coverage": {kind: [round(float(share), 3) for share in shares] for kind, shares in inside.items()},
-        },
+        source={**source, **found},
     )
-    assert np.all(np.isfinite(factors))
     save_model(out, network, config, half=True)
     return out
-
-
-_LEAST_DETECTED = 100  # a detector that finds less has learned nothing yet: the true boxes then stand in for its own
-
-
-def _errors(network: PoET, images: PackedImages, models: ObjectModels, boxes: Boxes) -> tuple[Array, Array]:
-    """Return (K, 6) errors and log variances."""
-    t, R, log_variance, truth = predict(network, images, len(images), models, boxes)
-    return pose_errors(t, R, truth).double().numpy(), log_variance.double().numpy()

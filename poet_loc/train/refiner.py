@@ -11,11 +11,13 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
+from poet_loc.core.input_error import at_least
 from poet_loc.data.coloured_points import coloured_points
 from poet_loc.data.packed import AugmentOptions, ObjectModels, PackedImages, Sample, load_models, pack
 from poet_loc.data.render import progress_bar
 from poet_loc.model.checkpoint import checksum
-from poet_loc.model.flow_pose import true_flow
+from poet_loc.model.flow_pose import rotation_of, true_flow
+from poet_loc.model.heads import rotation_matrices
 from poet_loc.model.poet import PoET
 from poet_loc.model.queries import real_queries
 from poet_loc.model.refiner import Comparison, Estimates, PoseRefiner, RefinerOptions
@@ -55,18 +57,9 @@ class RefinerLossOptions:
 
 
 @dataclass(frozen=True)
-class TrainRefinerOptions:
-    """Train a refiner for a trained network."""
+class StartOptions:
+    """Where comparisons start while the refiner learns."""
 
-    data: Path
-    """BOP data set with models/ and the splits."""
-    cache: Path
-    """Folder of the packed scenes."""
-    steps: StepOptions
-    """Length and speed."""
-    refiner: RefinerOptions = field(default_factory=RefinerOptions)
-    loss: RefinerLossOptions = field(default_factory=RefinerLossOptions)
-    augment: AugmentOptions = field(default_factory=AugmentOptions)
     estimated: float = 0.6
     """Share of the objects that start from the network's estimate; the others start beside the truth."""
     turn_deg: float = 8.0
@@ -77,19 +70,46 @@ class TrainRefinerOptions:
     """The same across, m."""
     jitter: float = 0.04
     """Standard deviation of the boxes' corners that the network is asked about, share of the box."""
+
+    def __post_init__(self) -> None:
+        at_least(0, self, "estimated", "turn_deg", "stretch", "shift_m", "jitter")
+
+
+@dataclass(frozen=True)
+class TrainRefinerOptions:
+    """Train a refiner for a trained network."""
+
+    train: Path
+    """BOP split folder to learn from."""
+    validation: Path
+    """BOP split folder of other images, for the figures in log.jsonl."""
+    models: Path
+    """BOP models folder, with textures or colours."""
+    cache: Path
+    """Folder of the packed scenes."""
+    steps: StepOptions
+    """Length and speed."""
+    refiner: RefinerOptions = field(default_factory=RefinerOptions)
+    loss: RefinerLossOptions = field(default_factory=RefinerLossOptions)
+    augment: AugmentOptions = field(default_factory=AugmentOptions)
+    starts: StartOptions = field(default_factory=StartOptions)
     val_images: int = 300
-    """Images of the validation split that are looked at."""
+    """Images of the validation split that are looked at, evenly spread."""
+    object_ids: tuple[int, ...] = ()
+    """BOP's numbers of classes 1, 2, ...; empty: all models by number."""
 
 
 def train_refiner(options: TrainRefinerOptions, network: PoET) -> PoseRefiner:
-    """Train (or go on training) a refiner, and return its averaged weights; the network stays as it is."""
-    models = load_models(options.data / "models")
+    """Train (or go on training) a refiner, and return its averaged weights; the network stays as it is.
+
+    Raises InputError for data that cannot be read or lack an object's model.
+    """
+    models = load_models(options.models, options.object_ids)
     refiner = _blank_refiner(options)
-    scenes = pack(options.data / "train", options.cache / "train")
-    train = PackedImages(scenes, models, stride=None)
-    val = PackedImages(pack(options.data / "val", options.cache / "val"), models, stride=None)
+    train = _packed(options.train, options.cache / "train", models)
+    val = packed_validation(options, models)
     kept = options.steps.out / f"estimates_{checksum(network.state_dict())[:12]}"
-    estimates = network_estimates(network, train, models, kept, options.jitter)
+    estimates = network_estimates(network, train, models, kept, options.starts.jitter)
     batch, seed = options.steps.batch, options.steps.seed
 
     def losses(module: PoseRefiner, step: int) -> Losses:
@@ -98,7 +118,7 @@ def train_refiner(options: TrainRefinerOptions, network: PoET) -> PoseRefiner:
         rngs = [np.random.default_rng([seed, 41, step, i]) for i in range(batch)]
         samples = [train.sample(n, rng, options.augment) for n, rng in zip(numbers, rngs)]
         known = [estimates[train.index[n][0]] for n in numbers]
-        starts = [_start(sample, poses, rng, options) for sample, poses, rng in zip(samples, known, rngs)]
+        starts = [_start(sample, poses, rng, options.starts) for sample, poses, rng in zip(samples, known, rngs)]
         images, truth = image_batch(samples), truth_of(samples, models)
         start = _estimates(samples, starts)
         assert images.intrinsics is not None
@@ -115,10 +135,21 @@ def train_refiner(options: TrainRefinerOptions, network: PoET) -> PoseRefiner:
     return train_steps(refiner, losses, options.steps, report)
 
 
+def packed_validation(options: TrainRefinerOptions, models: ObjectModels | None = None) -> PackedImages:
+    """Return the images that the figures are of."""
+    models = models or load_models(options.models, options.object_ids)
+    return _packed(options.validation, options.cache / "val", models, options.val_images)
+
+
+def _packed(split: Path, cache: Path, models: ObjectModels, most: int | None = None) -> PackedImages:
+    """Return a split's images, or so many of them, packed where they are not yet; depth and masks are not needed."""
+    return PackedImages(pack(split, cache, with_depth=False), models, stride=None, most=most)
+
+
 def _blank_refiner(options: TrainRefinerOptions) -> PoseRefiner:
     torch.manual_seed(options.steps.seed)
     refiner = PoseRefiner(options.refiner)
-    points, colours, diameters = coloured_points(options.data / "models", options.refiner.points)
+    points, colours, diameters = coloured_points(options.models, options.refiner.points, options.object_ids)
     refiner.show(torch.from_numpy(points).float(), torch.from_numpy(colours), torch.from_numpy(diameters).float())
     return refiner.to(memory_format=torch.channels_last)  # type: ignore[call-overload, no-any-return]
 
@@ -149,7 +180,7 @@ def network_estimates(
         for number, scene in enumerate(images.scenes):
             path = folder / f"{number:06d}.npy"
             if not path.exists():
-                poses = np.full((len(scene.classes), 3, 4), np.nan)
+                poses = np.full((len(scene.object_ids), 3, 4), np.nan)
                 for first in range(firsts[number], firsts[number + 1], batch):
                     rows = range(first, min(first + batch, firsts[number + 1]))
                     _estimate(network, images, models, rows, jitter, poses)
@@ -166,17 +197,16 @@ def _estimate(
     rngs = [np.random.default_rng([43, n]) for n in numbers]
     samples = [images.sample(n, rng) for n, rng in zip(numbers, rngs)]
     boxes = [jittered(sample.boxes, rng, jitter) for sample, rng in zip(samples, rngs)]
-    batch = image_batch(samples)
+    batch = image_batch(samples, network.detector.shape().multiple)
     queries, _ = queries_and_truth(samples, boxes, batch.size, network.options.queries, models)
     with torch.autocast("cpu", torch.bfloat16, enabled=low_precision("auto")):
         output = network.poses(network.extract(batch), batch.mask, queries, batch.intrinsics)
     real, rows = real_queries(queries), np.concatenate([sample.rows for sample in samples])
-    poses[rows, :, :3], poses[rows, :, 3] = output.rotation[real].numpy(), output.translation[real].numpy()
+    poses[rows, :, :3] = rotation_matrices(output.rotation[real]).float().numpy()
+    poses[rows, :, 3] = output.translation[real].float().numpy()
 
 
-def _start(
-    sample: Sample, estimates: Array, rng: np.random.Generator, options: TrainRefinerOptions
-) -> tuple[Array, Array]:
+def _start(sample: Sample, estimates: Array, rng: np.random.Generator, options: StartOptions) -> tuple[Array, Array]:
     """Return rotations and translations of a sample's objects, estimated or drawn beside the truth."""
     size = np.exp(rng.uniform(np.log(0.25), np.log(2.5), (len(sample.rows), 1)))
     turn = rng.normal(0.0, np.deg2rad(options.turn_deg), (len(size), 3)) * size
@@ -218,10 +248,13 @@ def refiner_losses(found: Comparison, truth: Truth, diameters: Tensor, weights: 
 
 
 def nearest_rotation(truth: Truth, estimate: Tensor) -> Tensor:
-    """Return the true rotations (K, 3, 3), of objects symmetric about z turned about it to be nearest the estimate."""
-    difference = truth.R.mT @ estimate
-    angle = torch.atan2(difference[:, 1, 0] - difference[:, 0, 1], difference[:, 0, 0] + difference[:, 1, 1])
-    angle = torch.where(truth.axes.abs().sum(1) > 0, angle, torch.zeros_like(angle))
-    zero, one = torch.zeros_like(angle), torch.ones_like(angle)
-    rows = [[angle.cos(), -angle.sin(), zero], [angle.sin(), angle.cos(), zero], [zero, zero, one]]
-    return truth.R @ torch.stack([torch.stack(row, -1) for row in rows], -2)
+    """Return the true rotations (K, 3, 3), of symmetric objects turned about their axis to be nearest the estimate.
+
+    Nearest: the turn by theta about a unit axis a with the largest trace(turn^T D), D = R_true^T R_estimate, which is
+    cos(theta) (trace(D) - a^T D a) + sin(theta) a . vee(D - D^T) + a^T D a.
+    """
+    D, a = truth.R.mT @ estimate, truth.axes
+    vee = torch.stack([D[:, 2, 1] - D[:, 1, 2], D[:, 0, 2] - D[:, 2, 0], D[:, 1, 0] - D[:, 0, 1]], -1)
+    along = (a[:, None] @ D @ a[..., None])[:, 0, 0]
+    angle = torch.atan2((a * vee).sum(1), D.diagonal(dim1=1, dim2=2).sum(1) - along)
+    return truth.R @ rotation_of(angle[:, None] * a)

@@ -9,7 +9,7 @@ import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Generic, TypeVar
+from typing import Generic, Literal, TypeVar
 
 import torch
 from torch import Tensor, nn
@@ -17,6 +17,8 @@ from torch import Tensor, nn
 from poet_loc.core.input_error import InputError
 from poet_loc.data.render import progress_bar
 from poet_loc.train.optimizer import Optimizer, OptimizerKind
+
+Precision = Literal["auto", "bfloat16", "float32"]
 
 
 @dataclass(frozen=True)
@@ -42,7 +44,7 @@ class StepOptions:
     """Largest norm of the gradient."""
     averaging: float = 0.999
     """Decay of the averaged weights."""
-    precision: str = "auto"
+    precision: Precision = "auto"
     """auto: bfloat16 where the CPU has matrix units for it, else float32."""
     seed: int = 0
     save_every: int = 250
@@ -55,7 +57,7 @@ Losses = dict[str, Tensor]
 Network = TypeVar("Network", bound=nn.Module)
 
 
-def low_precision(choice: str) -> bool:
+def low_precision(choice: Precision) -> bool:
     """Return whether to compute in bfloat16."""
     if choice == "auto":
         return bool(torch.cpu._is_amx_tile_supported())
@@ -170,6 +172,13 @@ def _save(
     partial = path.with_suffix(".partial")
     torch.save(state, partial)
     partial.replace(path)
+
+
+def last_row(folder: Path) -> dict[str, float]:
+    """Return the last row of a run's log.jsonl, {} where there is none."""
+    path = folder / "log.jsonl"
+    rows = path.read_text().splitlines() if path.exists() else []
+    return dict(json.loads(rows[-1])) if rows else {}
 
 
 def _log(path: Path, row: dict[str, float]) -> None:

@@ -20,7 +20,7 @@ def run(*arguments: object) -> int:
 
 
 @pytest.mark.parametrize(
-    "command", ["detect", "train", "calibrate", "export", "evaluate-poses", "convert checkpoint", "convert classes"]
+    "command", ["detect", "train", "train-refiner", "calibrate", "export", "evaluate-poses", "convert checkpoint", "convert classes"]
 )
 def test_help(command: str, capsys: pytest.CaptureFixture[str]) -> None:
     assert run(*command.split(), "--help") == 0

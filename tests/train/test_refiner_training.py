@@ -19,6 +19,7 @@ from poet_loc.train import refiner as stage
 from poet_loc.train.detector import image_batch
 from poet_loc.train.embedded import EMBEDDED, Truth, half_sines
 from poet_loc.train.refiner import (
+    StartOptions,
     TrainRefinerOptions,
     nearest_rotation,
     network_estimates,
@@ -51,11 +52,12 @@ def network() -> PoET:
     return PoET(TINY_POET, SmallDetector(TINY)).eval()
 
 
-def options(data, out, count: int, **changes) -> TrainRefinerOptions:
+def options(data, out, count: int, **starts) -> TrainRefinerOptions:
     steps = StepOptions(
         out, steps=count, batch=3, warmup=2, save_every=2, learning_rate=4e-3, precision="float32", optimizer="muon"
     )
-    return TrainRefinerOptions(data, data / "cache", steps, REFINER, val_images=3, **changes)
+    splits = data / "train", data / "val", data / "models"
+    return TrainRefinerOptions(*splits, data / "cache", steps, REFINER, val_images=3, starts=StartOptions(**starts))
 
 
 @pytest.fixture(scope="module")
@@ -70,7 +72,7 @@ def test_estimates_turn_with_the_augmented_image(data, images, tmp_path):
         rng = np.random.default_rng(number)
         sample = images.sample(number, rng, AugmentOptions(turn_deg=40.0))
         truth = images.scenes[images.index[number][0]].poses  # an estimator that is always right
-        R, t = stage._start(sample, truth, rng, asked)
+        R, t = stage._start(sample, truth, rng, asked.starts)
         np.testing.assert_allclose(R, sample.R_cam_obj, atol=1e-9)
         np.testing.assert_allclose(t, sample.t_cam_obj, atol=1e-9)
 
@@ -79,7 +81,7 @@ def test_starts_beside_the_truth_are_as_wrong_as_they_should_be(data, images, tm
     asked = options(data, tmp_path, 1, estimated=0.0)
     sample = next(s for s in (images.sample(n, np.random.default_rng(0)) for n in range(6)) if len(s.rows))
     nothing = np.full((100, 3, 4), np.nan)
-    starts = [stage._start(sample, nothing, np.random.default_rng(k), asked) for k in range(400)]
+    starts = [stage._start(sample, nothing, np.random.default_rng(k), asked.starts) for k in range(400)]
     turns = [(Rotation.from_matrix(R) * Rotation.from_matrix(sample.R_cam_obj).inv()).as_rotvec() for R, _ in starts]
     shares = np.linspace(0.25, 2.5, 100001)
     log_uniform = np.sum(shares) / np.sum(1 / shares)  # mean square of the drawn size
@@ -91,7 +93,7 @@ def test_starts_beside_the_truth_are_as_wrong_as_they_should_be(data, images, tm
 def test_estimates_are_kept_scene_by_scene(images, network, tmp_path, monkeypatch):
     models = images.models
     first = network_estimates(network, images, models, tmp_path, 0.04, batch=2)
-    assert [len(poses) for poses in first] == [len(scene.classes) for scene in images.scenes]
+    assert [len(poses) for poses in first] == [len(scene.object_ids) for scene in images.scenes]
     asked = np.concatenate([images.sample(n, np.random.default_rng(0)).rows for n in range(3)])
     assert np.array_equal(np.flatnonzero(~np.isnan(first[0][:, 0, 0])), np.sort(asked))
     (tmp_path / "000001.npy").unlink()
@@ -101,19 +103,21 @@ def test_estimates_are_kept_scene_by_scene(images, network, tmp_path, monkeypatc
     assert np.isnan(second[1]).all()
 
 
-def test_the_nearest_of_equal_rotations_is_that_of_the_axis_error():
+@pytest.mark.parametrize("axis", [(0.0, 0.0, 1.0), (1.0, 2.0, -2.0)])
+def test_the_nearest_of_equal_rotations_is_that_of_the_axis_error(axis):
     rng = np.random.default_rng(0)
     R = torch.from_numpy(Rotation.random(30, random_state=1).as_matrix())
     tilt = Rotation.from_rotvec(rng.normal(0, 0.3, (30, 3))).as_matrix()
-    about = Rotation.from_rotvec(np.outer(rng.uniform(-3, 3, 30), [0, 0, 1.0])).as_matrix()
+    axis = np.array(axis) / np.linalg.norm(axis)
+    about = Rotation.from_rotvec(np.outer(rng.uniform(-3, 3, 30), axis)).as_matrix()
     estimate = torch.from_numpy(tilt @ R.numpy() @ about)
-    axes = torch.tensor([[0.0, 0.0, 1.0]], dtype=torch.float64).repeat(30, 1)
+    axes = torch.from_numpy(axis).repeat(30, 1)
     truth = Truth(torch.zeros(30, 3), R, axes, torch.ones(30, 2), torch.ones(30))
     nearest = nearest_rotation(truth, estimate)
-    torch.testing.assert_close(nearest[:, :, 2], R[:, :, 2])
+    torch.testing.assert_close(nearest @ axes[0], R @ axes[0])
     best = half_sines(estimate, replace(truth, R=nearest, axes=0 * axes))
     for angle in np.linspace(-np.pi, np.pi, 61):
-        turn = torch.from_numpy(Rotation.from_rotvec([0, 0, angle]).as_matrix())
+        turn = torch.from_numpy(Rotation.from_rotvec(angle * axis).as_matrix())
         other = half_sines(estimate, replace(truth, R=R @ turn, axes=0 * axes))
         assert (other > best - 1e-9).all()
     plain = replace(truth, axes=0 * axes)
@@ -124,7 +128,7 @@ def test_it_learns_a_correction_by_heart(data, images, tmp_path):
     asked = options(data, tmp_path, 1, estimated=0.0)
     samples = [images.sample(n, np.random.default_rng(0)) for n in range(3)]
     nothing = np.full((100, 3, 4), np.nan)
-    starts = [stage._start(s, nothing, np.random.default_rng(k), asked) for k, s in enumerate(samples)]
+    starts = [stage._start(s, nothing, np.random.default_rng(k), asked.starts) for k, s in enumerate(samples)]
     start, truth, batch = stage._estimates(samples, starts), truth_of(samples, images.models), image_batch(samples)
     refiner = stage._blank_refiner(asked).train()
     optimizer, rows = torch.optim.AdamW(refiner.parameters(), 5e-3), []
