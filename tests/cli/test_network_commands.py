@@ -19,9 +19,10 @@ def run(*arguments: object) -> int:
     return main([str(argument) for argument in arguments])
 
 
-@pytest.mark.parametrize(
-    "command", ["detect", "train", "train-refiner", "calibrate", "export", "evaluate-poses", "convert checkpoint", "convert classes"]
-)
+OF_NETWORKS = ["detect", "train", "train-refiner", "calibrate", "export", "evaluate-poses"]
+
+
+@pytest.mark.parametrize("command", [*OF_NETWORKS, "convert checkpoint", "convert classes"])
 def test_help(command: str, capsys: pytest.CaptureFixture[str]) -> None:
     assert run(*command.split(), "--help") == 0
     assert "usage: poet-loc " + command in capsys.readouterr().out
