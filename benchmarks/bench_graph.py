@@ -35,6 +35,7 @@ import numpy as np
 from fusion import graph_builder, graph_factors, graph_smoother
 from fusion.graph import run_graph
 from fusion.graph_factors import bias_factor, robust
+from fusion.graph_fixed import FixedBuilder
 from fusion.graph_motion import MotionChain
 from fusion.graph_online import GraphEstimator
 from fusion.graph_smoother import FixedLagSmoother, joint_covariance
@@ -92,7 +93,8 @@ def record(problem: Any, options: FuseOptions) -> list[Keyframe]:
 
     def watched_take(self: graph_builder.GraphBuilder) -> Any:
         added = take(self)
-        tape[-1].values = [(key, _maker(added[1], key)) for key in list(added[1].keys())]
+        if not isinstance(self, FixedBuilder):
+            tape[-1].values = [(key, _maker(added[1], key)) for key in list(added[1].keys())]
         return added
 
     extend = FixedLagSmoother.extend

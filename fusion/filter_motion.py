@@ -6,7 +6,7 @@ import math
 
 from fusion.ballot import START_WINDOW_S
 from fusion.compiled import njit
-from fusion.imu import propagate_covariance, propagate_nominal, transition_blocks, write_gravity_basis
+from fusion.imu import mean_until, propagate_covariance, propagate_nominal, transition_blocks, write_gravity_basis
 from fusion.memory import (
     BIAS_TIME,
     IMU_AT,
@@ -47,20 +47,13 @@ def begin(m: Memory, stamp: int, specific_force: Array, imu_index: int) -> None:
 
 @njit(cache=True)
 def advance(m: Memory, w: Work, imu_stamps: Ints, imu_values: Array, until: int) -> None:
-    """Integrate the IMU from where the filter is up to a stamp, which the samples must reach.
-
-    Between two samples both signals are linear in time: the mean over a part of an interval is the value at its middle.
-    """
+    """Integrate the IMU from where the filter is up to a stamp, which the samples must reach."""
     c = m.counters
     rate, force = w.scratch[0:3], w.scratch[3:6]
     while c[NOW] < until:
         k = c[IMU_AT]
         start, end = imu_stamps[k], imu_stamps[k + 1]
-        stop = min(end, until)
-        share = 0.5 * ((c[NOW] - start) + (stop - start)) / (end - start)
-        for i in range(3):
-            rate[i] = imu_values[k, i] + share * (imu_values[k + 1, i] - imu_values[k, i])
-            force[i] = imu_values[k, 3 + i] + share * (imu_values[k + 1, 3 + i] - imu_values[k, 3 + i])
+        stop = mean_until(imu_stamps, imu_values, k, c[NOW], until, w.scratch)
         dt = (stop - c[NOW]) * 1e-9
         if m.noise[IS_ODOMETRY] > 0.0:
             _advance_by_odometry(m, w, dt, imu_values[k])

@@ -9,7 +9,7 @@ from fusion import memory
 from fusion.calibrated import calibrated
 from fusion.fuse import gate_log, never_started, result_from_rows
 from fusion.graph_batch import run_batch
-from fusion.graph_builder import GraphBuilder
+from fusion.graph_fixed import new_builder
 from fusion.graph_motion import MotionChain
 from fusion.graph_smoother import FixedLagSmoother
 from fusion.graph_walk import Walk
@@ -35,8 +35,7 @@ def run_fixed_lag(problem: Problem, options: FuseOptions) -> FuseResult:
     began = time.perf_counter()
     walk = Walk(problem, options)
     m, chain = walk.memory, MotionChain.of(problem, options)
-    fixed = options.graph.relinearize_every == 0
-    builder = GraphBuilder(problem.layout, m.x, m.bias_model, chain, options.graph, fixed)
+    builder = new_builder(problem.layout, m, chain, options.graph)
     smoother: FixedLagSmoother | None = None
     for keyframe in walk.keyframes():
         if keyframe.started or smoother is None:

@@ -11,15 +11,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fusion import object_biases
-from fusion.columns import Columns
-from fusion.eskf import ACCEPTED
-from fusion.graph_factors import Detection, Model, bias_factor, common_variables, linear_factor, measurement_factor
-from fusion.graph_linear import linearise
+from fusion.graph_arrangement import Arrangement
+from fusion.graph_factors import Detection, Model, bias_factor, measurement_factor
 from fusion.graph_model import bias_step
 from fusion.graph_motion import MotionChain
 from fusion.graph_odometry import OdometryStep, odometry_factor
 from fusion.graph_variables import (
-    Arrangement,
     CloneVariable,
     Variable,
     errors_of,
@@ -31,7 +28,7 @@ from fusion.graph_variables import (
     static_variables,
 )
 from fusion.graph_walk import Forgotten
-from fusion.measurements import OBJECT_POSE, ODOMETRY_STEP
+from fusion.measurements import OBJECT_POSE
 from fusion.nav_state import OBJECT_SIZE, StateLayout
 from fusion.options import Graph
 
@@ -92,13 +89,10 @@ class GraphBuilder:
         bias_model: Array,
         chain: MotionChain,
         options: Graph,
-        fixed: bool = False,
     ) -> None:
-        """fixed: what is added stays linearised where it was."""
         self.layout, self.bias_model, self.chain = layout, BiasModel(bias_model.copy()), chain
         self.model = Model(layout, x.copy(), chain.with_imu, options)
         self.keyframe, self.stamp_ns, self.x, self.origin = -1, 0, x.copy(), x.copy()
-        self.fixed = fixed
         self._spreads = slice(layout.spread_start, None)
         self._own: list[Variable] = []
         self._arrangement = Arrangement([])
@@ -211,9 +205,12 @@ class GraphBuilder:
 
     def _add_keyframe(self, stamp_ns: int) -> None:
         self.keyframe, self.stamp_ns = self.keyframe + 1, stamp_ns
-        self._own = keyframe_variables(self.keyframe, self.chain.with_imu)
+        self._own = self._keyframe_variables()
         for variable in self._own:
             self._add(variable)
+
+    def _keyframe_variables(self) -> list[Variable]:
+        return keyframe_variables(self.keyframe, self.chain.with_imu)
 
     def add_keyframe(self, stamp_ns: int, x: Array | None = None) -> None:
         """Add a keyframe and the motion up to it; it starts from x, or from what the motion predicts."""
@@ -239,61 +236,6 @@ class GraphBuilder:
             self.graph.add(odometry_factor(step, self.clone, self.keyframe, self.model))
         self.clone = self.keyframe
         self.origin[self._clone_variable().place] = self.origin[:OBJECT_SIZE]
-
-    def add_linearised(
-        self, columns: Columns, rotations: Array, covariances: Array, weights: Array, which: range
-    ) -> None:
-        """Add measurements that passed the gate to the newest keyframe, linearised where its variables start.
-
-        rotations and covariances are those that the filter used, weights those that the kernel gives.
-        """
-        every = slice(which.start, which.stop)
-        passed, kinds = columns.decisions[every] & ACCEPTED, columns.kinds[every].tolist()
-        seen: dict[int, None] = {}
-        for n, (kind, k) in enumerate(zip(kinds, columns.objects[every].tolist(), strict=True)):
-            if kind == ODOMETRY_STEP:
-                passed[n] = 0
-            elif kind == OBJECT_POSE and passed[n]:
-                seen[k] = None
-        private = {k: self._private_variables(k) for k in seen}
-        own, counts, shared, count = linearise(
-            which.start,
-            passed,
-            *columns[2:5],
-            rotations,
-            columns.translations,
-            covariances,
-            weights,
-            self.stamp_ns,
-            self.chain.stamps_ns,
-            self.chain.values,
-            not self.chain.with_imu,
-            self.x,
-            self.origin,
-            self.model.integers,
-        )
-        moved = int(columns.stamps[which.start]) != self.stamp_ns
-        common = common_variables(self.layout, self.keyframe, self.chain.with_imu, moved)
-        first = own.shape[1]
-        behind = [(key, first + at, size) for key, at, size in common]
-        blocks = [(own[k, : counts[k]], [*variables, *behind]) for k, variables in private.items() if counts[k]]
-        if count and blocks:  # one factor less
-            rows, variables = blocks[-1]
-            together = np.zeros((len(rows) + count, rows.shape[1]))
-            together[: len(rows)], together[len(rows) :, first:] = rows, shared[:count]
-            blocks[-1] = together, variables
-        elif count:
-            blocks = [(shared[:count], common)]
-        for rows, variables in blocks:
-            self.graph.add(linear_factor(rows, variables))
-
-    def _private_variables(self, k: int) -> list[tuple[int, int, int]]:
-        """Return key, first column and size of what an object's measurements alone see; add what there is not yet."""
-        kinds, found = self.layout.bias_kinds, []
-        if self.layout.objects:
-            self._meet(k)
-            found = [(object_variable(self.layout, k).key, 6 * kinds, 6)]
-        return [(self._bias_here(k, kind), 6 * kind, 6) for kind in range(kinds)] + found
 
     def place_new_objects(self, x: Array) -> None:
         """Let objects that the graph has not met start where they stand in a nominal array."""
@@ -351,12 +293,18 @@ class GraphBuilder:
     def _add_bias(self, chain: BiasChain, phi: Array | None, sigma: Array) -> None:
         """Add a bias variable at the newest keyframe: with a prior, or a step from the one before."""
         before, at = chain.variable, chain.variable.at
+        began = self.origin[at : at + 6].copy()
         if phi is not None:
             self.x[at : at + 6] *= phi
-            gap = phi * self.origin[at : at + 6] - self.x[at : at + 6] if self.fixed else None
         chain.variable, chain.stamp_ns = self._new_bias(chain), self.stamp_ns
         if phi is None:
             noise = gtsam.noiseModel.Diagonal.Sigmas(sigma)
             self.graph.addPriorVector(chain.variable.key, np.zeros(6), noise)
         else:
-            self.graph.add(bias_factor(before.key, chain.variable.key, phi, sigma, gap))
+            self.graph.add(self._bias_factor(before.key, chain.variable, phi, sigma, began))
+
+    def _bias_factor(
+        self, before: int, variable: Variable, phi: Array, sigma: Array, began: Array
+    ) -> gtsam.NonlinearFactor:
+        """Return the step to a bias from the one before, which began at `began`."""
+        return bias_factor(before, variable.key, phi, sigma)

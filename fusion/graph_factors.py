@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import cache, cached_property
+from functools import cached_property
 from typing import Any
 
 import gtsam
@@ -30,7 +30,6 @@ Array = NDArray[np.float64]
 Error = Callable[[gtsam.CustomFactor, gtsam.Values, "list[Array] | None"], Array]
 
 
-_IDENTITY, _ZEROS = np.eye(6), np.zeros(6)
 _NOWHERE = np.eye(4, order="F")  # as gtsam gives matrices: another order would be compiled once more
 
 
@@ -89,41 +88,12 @@ class Model:
         return [np.asarray(pose3(self.x, at).matrix()) for at in places]
 
 
-@cache
-def unit_noise(size: int) -> gtsam.noiseModel.Unit:
-    """Return the noise of rows that are white already."""
-    return gtsam.noiseModel.Unit.Create(size)
-
-
-def linear_factor(rows: Array, variables: Sequence[tuple[int, int, int]]) -> gtsam.NonlinearFactor:
-    """Return white rows [A, b] as a factor on variables (key, first column, size), each linearised where it starts."""
-    terms = [(key, rows[:, first : first + size]) for key, first, size in variables]
-    return gtsam.LinearContainerFactor(gtsam.GaussianConditional(terms, 1, rows[:, -1], unit_noise(len(rows))))
-
-
-def common_variables(layout: StateLayout, keyframe: int, with_imu: bool, moved: bool) -> list[tuple[int, int, int]]:
-    """Return key, first column (`graph_linear.SHARED`) and size of what every measurement after a keyframe sees.
-
-    moved: their stamp is not the keyframe's.
-    """
-    found = [(pose_key(keyframe), 0, 6)]
-    found += [(velocity_key(keyframe), VELOCITY_COLUMNS, 3)] if with_imu and (moved or layout.time_offset) else []
-    found += [(EXTRINSICS, EXTRINSIC_COLUMNS, 6)] if layout.extrinsics else []
-    return found + ([(OFFSET, OBJECT_COLUMNS, 1)] if layout.time_offset else [])
-
-
-def bias_factor(first: int, second: int, phi: Array, sigma: Array, gap: Array | None = None) -> gtsam.NonlinearFactor:
-    """Return the Gauss-Markov step b_second = phi b_first + w, w ~ sigma, between two object biases; all (6,).
-
-    gap: phi b_first - b_second where they start, for a graph that linearises nothing twice.
-    """
-    b = _ZEROS if gap is None else gap / sigma
-    linear = gtsam.JacobianFactor(first, _IDENTITY * (-phi / sigma), second, _IDENTITY / sigma, b, unit_noise(6))
-    if gap is not None:
-        return gtsam.LinearContainerFactor(linear)
-    zeros = gtsam.Values()
-    zeros.insert(first, _ZEROS)
-    zeros.insert(second, _ZEROS)
+def bias_factor(first: int, second: int, phi: Array, sigma: Array) -> gtsam.NonlinearFactor:
+    """Return the Gauss-Markov step b_second = phi b_first + w, w ~ sigma, between two object biases; all (6,)."""
+    unit, zeros = gtsam.noiseModel.Unit.Create(6), gtsam.Values()
+    linear = gtsam.JacobianFactor(first, np.diag(-phi / sigma), second, np.diag(1.0 / sigma), np.zeros(6), unit)
+    zeros.insert(first, np.zeros(6))
+    zeros.insert(second, np.zeros(6))
     return gtsam.LinearContainerFactor(linear, zeros)
 
 

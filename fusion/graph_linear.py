@@ -11,32 +11,47 @@ from __future__ import annotations
 import numpy as np
 
 from fusion.compiled import njit
-from fusion.eskf import POSITION_ONLY, ROTATION_ONLY, cholesky
+from fusion.eskf import ACCEPTED, POSITION_ONLY, ROTATION_ONLY, cholesky
 from fusion.graph_model import (
     BIAS_COLUMNS,
+    EXTRINSIC_COLUMNS,
     OBJECT_COLUMNS,
+    OFFSET_COLUMN,
+    VELOCITY_COLUMNS,
     error_and_jacobian,
     motion_between,
     rate_at,
 )
-from fusion.measurements import OBJECT_POSE
-from fusion.nav_state import ACCEL_BIAS, BIASES, GYRO_BIAS, N_BIAS_KINDS, N_OBJECTS, VELOCITY, Array, Ints
+from fusion.measurements import OBJECT_POSE, ODOMETRY_STEP
+from fusion.nav_state import (
+    ACCEL_BIAS,
+    AT_EXTRINSICS,
+    AT_OBJECTS,
+    AT_TIME_OFFSET,
+    BIASES,
+    GYRO_BIAS,
+    N_BIAS_KINDS,
+    N_OBJECTS,
+    VELOCITY,
+    Array,
+    Ints,
+)
 from fusion.so3_kernels import copy
 
-SHARED = 16  # columns that any measurement may have: pose, velocity, extrinsics, time offset; behind the private ones
 _NOTHING = 1e-10  # of a column's length: what rounding leaves of it
 
 
 @njit(cache=True, _nrt=True)
 def linearise(
     first: int,
-    passed: Ints,
+    end: int,
     stamps: Ints,
     kinds: Ints,
     objects: Ints,
     rotations: Array,
     translations: Array,
     covariances: Array,
+    decisions: Ints,
     weights: Array,
     keyframe_ns: int,
     motion_stamps: Ints,
@@ -45,85 +60,106 @@ def linearise(
     now: Array,
     start: Array,
     layout: Ints,
-) -> tuple[Array, Ints, Array, int]:
-    """Linearise measurements first..first+len(passed) at a nominal array `start`, whitened and weighted.
+) -> tuple[Array, Ints]:
+    """Linearise the measurements first..end-1 that passed the gate at a nominal array `start`, whitened and weighted.
 
-    passed: which rows of each the gate let through; weights: of every measurement. The motion from the keyframe is
-    integrated at the biases in the nominal array `now`; the object biases there are where their part is linearised, as
-    they may have begun far from it, and the right-hand side is brought to `start`. Returns rows of each object
-    (K, private, private + SHARED + 1) and how many, and those of all together (SHARED, SHARED + 1) and how many.
-    Columns: biases, object pose, what SHARED says, the right-hand side.
+    The motion from the keyframe is integrated at the biases in the nominal array `now`; the object biases there are
+    where their part is linearised, as they may have begun far from it, and the right-hand side is brought to `start`.
+    Returns rows [A, b] with the columns that `columns_of` names, and where those of each object begin (K + 1,); those
+    behind have nothing in the columns that belong to an object.
     """
-    biases, n_objects = now[GYRO_BIAS : ACCEL_BIAS + 3] if not odometry else np.zeros(6), layout[N_OBJECTS]
-    private = 6 * layout[N_BIAS_KINDS] + 6
-    rows, owners = np.zeros((6 * len(passed), private + SHARED + 1)), np.zeros(6 * len(passed), dtype=np.int64)
-    x, here, count = np.empty(len(start)), np.copy(start), 0
+    biases, x = now[GYRO_BIAS : ACCEL_BIAS + 3] if not odometry else np.zeros(6), np.empty(len(start))
+    columns = columns_of(layout, not odometry and (layout[AT_TIME_OFFSET] >= 0 or stamps[first] != keyframe_ns))
+    rows, owners, count = np.empty((6 * (end - first), len(columns) + 1)), np.empty(6 * (end - first), np.int64), 0
+    here = np.copy(start)
     for i in range(3 if odometry else 0):  # it knows no velocity
         here[VELOCITY + i] = 0.0
     copy(now[layout[BIASES] :], here[layout[BIASES] :])
-    for n in range(len(passed)):
-        i = first + n
-        if passed[n] == 0:
+    for i in range(first, end):
+        passed = decisions[i] & ACCEPTED
+        if passed == 0 or kinds[i] == ODOMETRY_STEP:
             continue
-        above, end = 0 if passed[n] & ROTATION_ONLY else 3, 6 if passed[n] & POSITION_ONLY else 3
+        above, below = 0 if passed & ROTATION_ONLY else 3, 6 if passed & POSITION_ONLY else 3
         motion = motion_between(motion_stamps, motion_values, keyframe_ns, stamps[i], biases, odometry)
         rate = rate_at(motion_stamps, motion_values, stamps[i], biases[0:3])
         copy(here, x)
-        size = end - above
-        e, J = error_and_jacobian(
-            kinds[i], objects[i], above, size, rotations[i], translations[i], rate, motion, x, layout
-        )
-        for kind in range(layout[N_BIAS_KINDS] if kinds[i] == OBJECT_POSE else 0):
-            at = layout[BIASES] + 6 * (objects[i] + kind * n_objects)
-            for r in range(size):
-                for c in range(6):
-                    e[r] -= J[r, BIAS_COLUMNS + 6 * kind + c] * (now[at + c] - start[at + c])
-        _whiten(J, e, covariances[i], above, weights[i])
-        for r in range(size):
-            _arrange(J[r], -e[r], rows[count], private)
-            owners[count] = objects[i] if kinds[i] == OBJECT_POSE else -1
-            count += 1
-    return _compress(rows[:count], owners[:count], n_objects, private)
+        seen = kinds[i], objects[i], above, below - above, rotations[i], translations[i]
+        e, J = error_and_jacobian(*seen, rate, motion, x, layout)
+        if kinds[i] == OBJECT_POSE:
+            _bring_to(start, now, objects[i], J, e, layout)
+        own = rows[count : count + len(e)]
+        for r in range(len(e)):
+            owners[count + r] = objects[i] if kinds[i] == OBJECT_POSE else -1
+            own[r, -1] = -e[r]
+            for c in range(len(columns)):
+                own[r, c] = J[r, columns[c]]
+        whiten_rows(covariances[i], above, own)
+        for r in range(len(e)):
+            for c in range(own.shape[1]):
+                own[r, c] *= np.sqrt(weights[i])
+        count += len(e)
+    return _compress(rows[:count], owners[:count], layout[N_OBJECTS], private_size(layout))
 
 
 @njit(cache=True)
-def _whiten(J: Array, e: Array, covariance: Array, first: int, weight: float) -> None:
-    """Bring an error and its Jacobian to unit noise, and scale both by the root of a weight."""
-    size, L = len(e), np.zeros((6, 6))
-    cholesky(covariance, first, size, L)
-    for r in range(size):
-        for s in range(r):
-            e[r] -= L[r, s] * e[s]
-            for c in range(J.shape[1]):
-                J[r, c] -= L[r, s] * J[s, c]
-        e[r] /= L[r, r]
-        for c in range(J.shape[1]):
-            J[r, c] /= L[r, r]
-    for r in range(size):
-        e[r] *= np.sqrt(weight)
-        for c in range(J.shape[1]):
-            J[r, c] *= np.sqrt(weight)
-
-
-@njit(cache=True)
-def _arrange(J: Array, b: float, row: Array, private: int) -> None:
-    """Write a Jacobian's row with the private columns first."""
-    for c in range(private - 6):
-        row[c] = J[BIAS_COLUMNS + c]
-    for c in range(6):
-        row[private - 6 + c] = J[OBJECT_COLUMNS + c]
-    for c in range(OBJECT_COLUMNS):
-        row[private + c] = J[c]
-    row[private + OBJECT_COLUMNS] = J[OBJECT_COLUMNS + 6]
-    row[private + SHARED] = b
+def private_size(layout: Ints) -> int:
+    """Return how many columns belong to an object: its biases and, where it is estimated, its pose."""
+    return 6 * layout[N_BIAS_KINDS] + (6 if layout[AT_OBJECTS] >= 0 else 0)
 
 
 @njit(cache=True, _nrt=True)
-def _compress(rows: Array, owners: Ints, n_objects: int, private: int) -> tuple[Array, Ints, Array, int]:
-    width = rows.shape[1]
-    own, counts = np.zeros((n_objects, private, width)), np.zeros(n_objects, dtype=np.int64)
-    shared, left = np.zeros((max(len(rows), SHARED), SHARED + 1)), 0
-    block = np.empty_like(rows)
+def columns_of(layout: Ints, velocity: bool) -> Ints:
+    """Return which columns of a detection's Jacobian rows have, in this order.
+
+    Biases and pose of the object, pose and (if asked for) velocity of the keyframe, extrinsics, time offset.
+    """
+    found, count = np.empty(BIAS_COLUMNS + 6 * layout[N_BIAS_KINDS], dtype=np.int64), 0
+    parts = (
+        (BIAS_COLUMNS, 6 * layout[N_BIAS_KINDS]),
+        (OBJECT_COLUMNS, 6 if layout[AT_OBJECTS] >= 0 else 0),
+        (0, 6),
+        (VELOCITY_COLUMNS, 3 if velocity else 0),
+        (EXTRINSIC_COLUMNS, 6 if layout[AT_EXTRINSICS] >= 0 else 0),
+        (OFFSET_COLUMN, 1 if layout[AT_TIME_OFFSET] >= 0 else 0),
+    )
+    for at, size in parts:
+        for c in range(size):
+            found[count + c] = at + c
+        count += size
+    return found[:count]
+
+
+@njit(cache=True)
+def _bring_to(start: Array, now: Array, k: int, J: Array, e: Array, layout: Ints) -> None:
+    """Say of an error with the object biases in `now` what it is, to first order, with those in `start`."""
+    for kind in range(layout[N_BIAS_KINDS]):
+        at = layout[BIASES] + 6 * (k + kind * layout[N_OBJECTS])
+        for r in range(len(e)):
+            for c in range(6):
+                e[r] -= J[r, BIAS_COLUMNS + 6 * kind + c] * (now[at + c] - start[at + c])
+
+
+@njit(cache=True)
+def whiten_rows(covariance: Array, first: int, rows: Array) -> None:
+    """Bring rows of the covariance that begins at row and column `first` of this one to unit noise."""
+    size, L = len(rows), np.zeros((len(rows), len(rows)))
+    cholesky(covariance, first, size, L)
+    for r in range(size):
+        for s in range(r):
+            for c in range(rows.shape[1]):
+                rows[r, c] -= L[r, s] * rows[s, c]
+        for c in range(rows.shape[1]):
+            rows[r, c] /= L[r, r]
+
+
+@njit(cache=True, _nrt=True)
+def _compress(rows: Array, owners: Ints, n_objects: int, private: int) -> tuple[Array, Ints]:
+    """Return as few rows that say the same, by object, and behind them what is left over of all; and where each begin.
+
+    Nothing that is left over has any part in the private columns, so that it is one problem.
+    """
+    begins, count, left = np.zeros(n_objects + 1, dtype=np.int64), 0, 0
+    turned, shared, block = np.zeros_like(rows), np.zeros_like(rows), np.empty_like(rows)
     for k in range(-1, n_objects):
         size = 0
         for r in range(len(rows)):
@@ -133,13 +169,16 @@ def _compress(rows: Array, owners: Ints, n_objects: int, private: int) -> tuple[
         taken = triangularise(block[:size], private) if k >= 0 else 0
         for r in range(size):
             if r < taken:
-                copy(block[r], own[k, r])
+                copy(block[r], turned[count + r])
             else:
-                copy(block[r, private:], shared[left])
+                copy(block[r], shared[left])
                 left += 1
-        if k >= 0:
-            counts[k] = taken
-    return own, counts, shared, triangularise(shared[:left], SHARED)
+        count += taken
+        begins[k + 1] = count
+    for r in range(triangularise(shared[:left], shared.shape[1] - 1)):
+        copy(shared[r], turned[count])
+        count += 1
+    return turned[:count], begins
 
 
 @njit(cache=True)

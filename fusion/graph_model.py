@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from fusion.compiled import njit
-from fusion.imu import propagate_nominal
+from fusion.imu import mean_until, propagate_nominal
 from fusion.measurements import MAX_COLUMNS, OBJECT_POSE, residual_and_jacobian, write_bias_axes
 from fusion.nav_state import (
     AT_EXTRINSICS,
@@ -49,19 +49,18 @@ def imu_between(
     accelerometer), so that an integrator that holds the attitude of a step's start sees the middle's. The sum over
     gaps is of step times interval, in intervals longer than longest_s.
     """
-    x, work = np.zeros(OBJECTS), np.zeros(64)
+    x, work, mean = np.zeros(OBJECTS), np.zeros(64), np.zeros(6)
     k = np.searchsorted(imu_stamps, start, side="right") - 1
     now, count, gaps = start, 0, 0.0
     while now < end:
-        stop, interval = min(imu_stamps[k + 1], end), imu_stamps[k + 1] - imu_stamps[k]
-        share = 0.5 * ((now - imu_stamps[k]) + (stop - imu_stamps[k])) / interval
+        stop, interval = mean_until(imu_stamps, imu_values, k, now, end, mean), imu_stamps[k + 1] - imu_stamps[k]
         dt = (stop - now) * 1e-9
         for i in range(9):
             x[i] = 1.0 if i % 4 == 0 else 0.0
         for i in range(6):
             x[GYRO_BIAS + i] = biases[i]
-            out[count, 1 + i] = imu_values[k, i] + share * (imu_values[k + 1, i] - imu_values[k, i])
-        propagate_nominal(x, dt, out[count, 1:4], out[count, 4:7], work)
+            out[count, 1 + i] = mean[i]
+        propagate_nominal(x, dt, mean[0:3], mean[3:6], work)
         out[count, 0] = dt
         for i in range(3):
             out[count, 4 + i] = work[24 + i] + biases[3 + i]
@@ -85,14 +84,11 @@ def motion_between(stamps: Ints, values: Array, start: int, end: int, biases: Ar
     k = np.searchsorted(stamps, start, side="right") - 1
     now = start
     while now < end:
-        stop = min(stamps[k + 1], end)
+        stop = mean_until(stamps, values, k, now, end, mean)
         dt = (stop - now) * 1e-9
         if odometry:
             move_by_odometry(x, dt, values[k, 0:3], values[k, 3:6], work)
         else:
-            share = 0.5 * ((now - stamps[k]) + (stop - stamps[k])) / (stamps[k + 1] - stamps[k])
-            for i in range(6):
-                mean[i] = values[k, i] + share * (values[k + 1, i] - values[k, i])
             propagate_nominal(x, dt, mean[0:3], mean[3:6], work)
         now, k = stop, k + 1
     motion[SECONDS] = 0.0 if odometry else (end - start) * 1e-9

@@ -13,7 +13,7 @@ from fusion.graph_variables import GRAVITY_KEY, imu_bias, imu_bias_key, pose_key
 from fusion.imu_noise import ACCEL_SQUARES, GYRO_SQUARES, density_squared, imu_rows
 from fusion.nav_state import ACCEL_BIAS, GRAVITY, GYRO_BIAS
 from fusion.options import FuseOptions
-from fusion.prepare import Problem
+from fusion.prepare import Problem, motion_noise
 from poet_loc.core.records import ImuNoise
 
 Array = NDArray[np.float64]
@@ -33,6 +33,8 @@ class MotionChain:
     values: Array
     """(N, 9) angular velocity and specific force, or odometry's twists, and their noise (`imu_noise.imu_rows`)."""
     noise: ImuNoise
+    densities: Array
+    """The filter's (`prepare.motion_noise`)."""
     options: FuseOptions
     with_imu: bool
     """False: odometry, which knows no velocity and no biases."""
@@ -41,10 +43,9 @@ class MotionChain:
     @classmethod
     def of(cls, problem: Problem, options: FuseOptions) -> MotionChain:
         """Return the chain of a problem."""
-        with_imu = problem.motion != "odometry"
-        return cls(
-            problem.imu.stamps_ns, imu_rows(problem.imu), problem.imu_noise, options, with_imu, problem.layout.gravity
-        )
+        imu, with_imu, gravity = problem.imu, problem.motion != "odometry", problem.layout.gravity
+        noise = problem.imu_noise, motion_noise(problem, options)
+        return cls(imu.stamps_ns, imu_rows(imu), *noise, options, with_imu, gravity)
 
     def motion(self, start: int, end: int, x: Array) -> Array:
         """Return the motion (MOTION_SIZE,) between two stamps at the biases in a nominal array."""

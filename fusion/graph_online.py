@@ -24,7 +24,7 @@ from scipy.spatial.transform import Rotation
 from fusion import memory
 from fusion.columns import Columns
 from fusion.fuse import loop_columns
-from fusion.graph_builder import GraphBuilder
+from fusion.graph_fixed import new_builder
 from fusion.graph_motion import MotionChain
 from fusion.graph_smoother import FixedLagSmoother
 from fusion.graph_walk import IMU_ROW, NEXT, ROWS, Walk
@@ -187,8 +187,7 @@ class GraphEstimator(Estimator):
         walk.cursor[ROWS] = 0
         while (keyframe := walk.next_keyframe(to_the_end=False)) is not None:
             if keyframe.started or self._smoother is None:
-                options, m = self.options.graph, self.memory
-                builder = GraphBuilder(self.layout, m.x, m.bias_model, chain, options, options.relinearize_every == 0)
+                builder = new_builder(self.layout, self.memory, chain, self.options.graph)
                 self._smoother = FixedLagSmoother(builder, self.options.graph)
                 self._smoother.start(keyframe, walk)
             else:

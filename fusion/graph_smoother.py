@@ -18,6 +18,7 @@ from scipy.linalg.lapack import dtrtri
 from fusion.eskf import ACCEPTED, POSITION_ONLY, ROTATION_ONLY
 from fusion.graph_builder import GraphBuilder
 from fusion.graph_factors import Detection
+from fusion.graph_fixed import FixedBuilder
 from fusion.graph_model import seen_at
 from fusion.graph_odometry import odometry_at
 from fusion.graph_walk import Keyframe, Walk
@@ -164,9 +165,7 @@ class FixedLagSmoother:
         builder, variables = self.builder, self.builder.newest
         root, step = newest_root(self._isam, [variable.key for variable in variables])
         arrangement = builder.arrangement(variables)
-        arrangement.move(builder.x, builder.origin, step)
-        arrangement.copy(builder.x, m.x)
-        J_root = arrangement.rows_to_filter(builder.x, root)
+        J_root = arrangement.settle(builder.origin, builder.x, m.x, step, root)
         m.P[arrangement.errors[:, None], arrangement.errors] = self._carried(J_root @ J_root.T, m.x)
         if builder.clone == builder.keyframe:
             clone_pose(m.x, m.P, m.layout)
@@ -226,7 +225,7 @@ def add_measurements(builder: GraphBuilder, walk: Walk, which: range) -> None:
     c, layout = walk.columns, builder.layout
     whole = c.stamps[which[0]] == builder.stamp_ns and not (layout.extrinsics or layout.time_offset)
     native = whole and CAMERA_POSE in c.kinds[which.start : which.stop].tolist()  # gtsam has a factor for it
-    if builder.fixed and not native:
+    if isinstance(builder, FixedBuilder) and not native:
         builder.add_linearised(c, walk.rotations, walk.covariances, walk.weights, which)
     else:
         builder.add_detections(detections(builder, walk, which))

@@ -8,11 +8,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import ClassVar
 
 import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
+from fusion.graph_arrangement import CLONE, GRAVITY_VECTOR, IMU_BIAS, POSE, VECTOR
 from fusion.nav_state import (
     ACCEL_BIAS,
     EXTRINSIC_ROTATION,
@@ -90,6 +92,7 @@ class Variable:
     key: int
     errors: range
     at: int
+    kind: ClassVar[int] = VECTOR
 
     @property
     def size(self) -> int:
@@ -105,26 +108,13 @@ class Variable:
         """Its place in the nominal array."""
         return slice(self.at, self.at + self.size)
 
-    @property
-    def added(self) -> Sequence[int] | None:
-        """What of a step is added to each number in its place, which is its error too; None: it is not that simple."""
-        return range(self.size)
-
     def read(self, values: gtsam.Values, x: Array) -> None:
         """Write its value into the nominal array."""
         x[self.at : self.at + self.size] = values.atVector(self.key)
 
-    def moved(self, x: Array, step: Array) -> Array:
-        """Return what stands in its place of the nominal array after a step in gtsam's tangent."""
-        return np.asarray(x[self.at : self.at + len(step)] + step)
-
     def to_filter(self, x: Array) -> Array:
         """Return the derivative of the filter's errors by gtsam's tangent."""
         return np.eye(self.size)
-
-    def rows_to_filter(self, x: Array, rows: Array) -> Array:
-        """Return to_filter(x) @ rows."""
-        return rows
 
     def from_filter(self, x: Array) -> Array:
         """Return the derivative of gtsam's tangent by the filter's errors."""
@@ -137,6 +127,8 @@ class Variable:
 
 class PoseVariable(Variable):
     """A Pose3: gtsam measures its translation error in its own axes, the filter in the axes around it."""
+
+    kind = POSE
 
     def insert(self, values: gtsam.Values, x: Array) -> None:
         """Add it to values with what stands in the nominal array."""
@@ -153,44 +145,25 @@ class PoseVariable(Variable):
         """Its place in the nominal array."""
         return slice(self.at, self.at + OBJECT_SIZE)
 
-    @property
-    def added(self) -> None:
-        """Nothing: a pose is turned and shifted."""
-        return None
-
-    def moved(self, x: Array, step: Array) -> Array:
-        """Return what stands in its place of the nominal array after a step in gtsam's tangent."""
-        T = pose3(x, self.at).retract(step)
-        return np.concatenate((*T.rotation().matrix(), T.translation()))
-
     def to_filter(self, x: Array) -> Array:
         """Return the derivative of the filter's errors by gtsam's tangent."""
         return block_diagonal([_EYE, x[self.at : self.at + 9].reshape(3, 3)])
-
-    def rows_to_filter(self, x: Array, rows: Array) -> Array:
-        """Return to_filter(x) @ rows."""
-        return np.concatenate((rows[:3], x[self.at : self.at + 9].reshape(3, 3) @ rows[3:]))
 
 
 class CloneVariable(PoseVariable):
     """The pose at the last odometry: the filter's clone of it has its error in world axes."""
 
+    kind = CLONE
+
     def to_filter(self, x: Array) -> Array:
         """Return the derivative of [xi, rho], R_true = Exp(xi) R and p_true = Exp(xi) p + rho, by gtsam's tangent."""
         return np.asarray(pose3(x, self.at).AdjointMap())
-
-    def rows_to_filter(self, x: Array, rows: Array) -> Array:
-        """Return to_filter(x) @ rows."""
-        return np.asarray(self.to_filter(x) @ rows)
 
 
 class ImuBiasVariable(Variable):
     """The IMU's bias: [accelerometer, gyroscope] in gtsam, [gyroscope, accelerometer] in the filter."""
 
-    @property
-    def added(self) -> Sequence[int]:
-        """What of a step is added to each number in its place, which is its error too."""
-        return 3, 4, 5, 0, 1, 2
+    kind = IMU_BIAS
 
     def insert(self, values: gtsam.Values, x: Array) -> None:
         """Add it to values with what stands in the nominal array."""
@@ -201,39 +174,24 @@ class ImuBiasVariable(Variable):
         bias = values.atConstantBias(self.key)
         x[GYRO_BIAS : GYRO_BIAS + 3], x[ACCEL_BIAS : ACCEL_BIAS + 3] = bias.gyroscope(), bias.accelerometer()
 
-    def moved(self, x: Array, step: Array) -> Array:
-        """Return what stands in its place of the nominal array after a step in gtsam's tangent."""
-        return np.asarray(x[self.place] + self.rows_to_filter(x, step))
-
     def to_filter(self, x: Array) -> Array:
         """Return the derivative of the filter's errors by gtsam's tangent."""
         return np.roll(np.eye(6), 3, axis=0)
 
-    def rows_to_filter(self, x: Array, rows: Array) -> Array:
-        """Return to_filter(x) @ rows."""
-        return np.concatenate((rows[3:], rows[:3]))
-
 
 class GravityVariable(Variable):
     """Gravity: a vector whose length is all but fixed in gtsam, two angles in the filter."""
+
+    kind = GRAVITY_VECTOR
 
     @property
     def size(self) -> int:
         """Size of its tangent in gtsam."""
         return 3
 
-    @property
-    def added(self) -> None:
-        """Nothing: its errors are two angles."""
-        return None
-
     def to_filter(self, x: Array) -> Array:
         """Return the derivative of the filter's errors by gtsam's tangent."""
         return np.asarray(np.linalg.pinv(self.from_filter(x)))
-
-    def rows_to_filter(self, x: Array, rows: Array) -> Array:
-        """Return to_filter(x) @ rows."""
-        return np.asarray(self.to_filter(x) @ rows)
 
     def from_filter(self, x: Array) -> Array:
         """Return the derivative of gtsam's tangent by the filter's errors."""
@@ -245,60 +203,16 @@ class GravityVariable(Variable):
         return super().slack(x) + _LENGTH_OF_GRAVITY**2 * np.outer(g, g) / (g @ g)
 
 
-class Arrangement:
-    """Where variables, one behind the other, stand in the filter's nominal array and error state, whatever their keys.
-
-    What a step is only added to is written all at once: most variables are of that kind, and numpy's calls are what a
-    keyframe's few numbers cost.
-    """
-
-    def __init__(self, variables: Sequence[Variable]) -> None:
-        self.errors = np.array([i for variable in variables for i in variable.errors], dtype=np.int64)
-        places, sources, rows, everywhere = list[int](), list[int](), list[int](), list[int]()
-        self._turned: list[tuple[Variable, slice, slice]] = []
-        first = row = 0
-        for v in variables:
-            n = len(v.errors)
-            if v.added is None:
-                self._turned.append((v, slice(first, first + v.size), slice(row, row + n)))
-            else:
-                places += range(v.at, v.at + n)
-                sources += [first + i for i in v.added]
-                rows += range(row, row + n)
-            everywhere += range(v.place.start, v.place.stop)
-            first, row = first + v.size, row + n
-        self._places, self._sources, self._rows, self._everywhere = map(np.array, (places, sources, rows, everywhere))
-
-    def move(self, x: Array, origin: Array, step: Array) -> None:
-        """Write into the nominal array x what comes of a step in gtsam's tangents from another one."""
-        if len(self._places):
-            x[self._places] = origin[self._places] + step[self._sources]
-        for variable, tangent, _ in self._turned:
-            x[variable.place] = variable.moved(origin, step[tangent])
-
-    def rows_to_filter(self, x: Array, rows: Array) -> Array:
-        """Return rows of gtsam's tangents as rows of the filter's errors, at x."""
-        found = np.empty((len(self.errors), rows.shape[1]))
-        if len(self._rows):
-            found[self._rows] = rows[self._sources]
-        for variable, tangent, errors in self._turned:
-            found[errors] = variable.rows_to_filter(x, rows[tangent])
-        return found
-
-    def copy(self, source: Array, target: Array) -> None:
-        """Copy the variables from one nominal array to another."""
-        target[self._everywhere] = source[self._everywhere]
-
-
-def keyframe_variables(k: int, with_imu: bool) -> list[Variable]:
-    """Return the variables of keyframe k: the pose, and with an IMU velocity and biases."""
+def keyframe_variables(k: int, with_imu: bool, plain: bool = False) -> list[Variable]:
+    """Return the variables of keyframe k: the pose, and with an IMU velocity and biases (plain: as a vector)."""
     pose = PoseVariable(pose_key(k), range(6), 0)
     if not with_imu:
         return [pose]
+    biases = Variable if plain else ImuBiasVariable
     return [
         pose,
         Variable(velocity_key(k), range(6, 9), VELOCITY),
-        ImuBiasVariable(imu_bias_key(k), range(9, 15), GYRO_BIAS),
+        biases(imu_bias_key(k), range(9, 15), GYRO_BIAS),
     ]
 
 

@@ -37,6 +37,20 @@ MEASURED = 10  # 1 where the samples' own noise counts, behind those of odometry
 
 
 @njit(cache=True)
+def mean_until(stamps: Ints, values: Array, k: int, now: int, until: int, mean: Array) -> int:
+    """Write the mean (6,) of both signals from now to sample k + 1 or until a stamp; return when that is.
+
+    Between two samples both are linear in time: the mean over a part of an interval is the value at its middle.
+    """
+    start, end = stamps[k], stamps[k + 1]
+    stop = min(end, until)
+    share = 0.5 * ((now - start) + (stop - start)) / (end - start)
+    for i in range(6):
+        mean[i] = values[k, i] + share * (values[k + 1, i] - values[k, i])
+    return stop
+
+
+@njit(cache=True)
 def propagate_nominal(x: Array, dt: float, angular_velocity: Array, specific_force: Array, work: Array) -> None:
     """Move the nominal state by dt seconds, in place; S eq. 260 with the midpoint attitude.
 
@@ -90,7 +104,7 @@ def transition_blocks(dt: float, work: Array, blocks: Array) -> None:
 
 
 @njit(cache=True)
-def _rows_times(
+def rows_times(
     blocks: Array, dt: float, gravity_basis: Array, at_gravity: int, P: Array, columns: int, scratch: Array
 ) -> None:
     """P[:15, :columns] <- F P[:15, :columns] for the core's transition F, in place (and gravity's two columns of F)."""
@@ -140,7 +154,7 @@ def propagate_covariance(
     (bias states decay at updates only), so the cost grows with n and not with its square.
     """
     n, at_gravity = layout[N_ERROR], layout[AT_GRAVITY]
-    _rows_times(blocks, dt, gravity_basis, at_gravity, P, n, scratch)
+    rows_times(blocks, dt, gravity_basis, at_gravity, P, n, scratch)
     # (F P) F^T: the bias rows of F are identity, so that what is left is the block of attitude, position and velocity.
     for i in range(GYRO_BIAS_ERROR):
         for j in range(CORE):
@@ -148,7 +162,7 @@ def propagate_covariance(
         if at_gravity >= 0:
             core[CORE, i] = P[i, at_gravity]
             core[CORE + 1, i] = P[i, at_gravity + 1]
-    _rows_times(blocks, dt, gravity_basis, CORE if at_gravity >= 0 else -1, core, GYRO_BIAS_ERROR, scratch)
+    rows_times(blocks, dt, gravity_basis, CORE if at_gravity >= 0 else -1, core, GYRO_BIAS_ERROR, scratch)
     for i in range(GYRO_BIAS_ERROR):
         for j in range(i, GYRO_BIAS_ERROR):
             P[i, j] = P[j, i] = 0.5 * (core[i, j] + core[j, i])

@@ -180,26 +180,14 @@ def _bias_kinds(bias: DetectionBias) -> int:
 
 def fill_memory(problem: Problem, options: FuseOptions) -> tuple[Array, NDArray[np.int64]]:
     """Return the buffers of a filter that has not begun yet."""
-    layout, landmark_map, imu_noise = problem.layout, problem.landmark_map, problem.imu_noise
-    calibration = problem.calibration
+    layout, landmark_map, calibration = problem.layout, problem.landmark_map, problem.calibration
     floats, integers = memory.allocate(layout)
     m = memory.views.py_func(floats, integers)
     T_imu_cam = None if calibration.T_cam_imu is None else calibration.T_cam_imu.inv()
     T_world_obj = landmark_map.T_world_obj if layout.n_objects and landmark_map is not None else None
     gravity = STANDARD_GRAVITY if problem.motion in WITH_IMU else 0.0
     m.x[:] = nominal_state(layout, T_imu_cam=T_imu_cam, T_world_obj=T_world_obj, gravity=gravity)
-    m.noise[[imu.GYRO_NOISE, imu.ACCEL_NOISE, imu.GYRO_WALK, imu.ACCEL_WALK]] = (
-        imu_noise.gyroscope_noise_density,
-        imu_noise.accelerometer_noise_density,
-        imu_noise.gyroscope_random_walk,
-        imu_noise.accelerometer_random_walk,
-    )
-    m.noise[[imu.GAP_S, imu.GAP_RATE, imu.GAP_ACCEL]] = (
-        options.gap.longest_s,
-        options.gap.angular_rate,
-        options.gap.acceleration,
-    )
-    m.noise[imu.MEASURED] = options.imu.measured and problem.motion in WITH_IMU
+    m.noise[:] = motion_noise(problem, options)
     m.limits[: filter_update.SETTLED + 1] = _limits(options)
     m.start[: ballot.LEAD + 1] = _start(options)
     if options.start.pose is not None:
@@ -225,19 +213,30 @@ def fill_memory(problem: Problem, options: FuseOptions) -> tuple[Array, NDArray[
     return floats, integers
 
 
+def motion_noise(problem: Problem, options: FuseOptions) -> Array:
+    """Return the noise of what carries the filter, in its places (`imu.py`, `odometry.py`)."""
+    noise, own, gap, with_imu = np.zeros(12), problem.imu_noise, options.gap, problem.motion in WITH_IMU
+    noise[[imu.GYRO_NOISE, imu.ACCEL_NOISE]] = own.gyroscope_noise_density, own.accelerometer_noise_density
+    noise[[imu.GYRO_WALK, imu.ACCEL_WALK]] = own.gyroscope_random_walk, own.accelerometer_random_walk
+    noise[[imu.GAP_RATE, imu.GAP_ACCEL]] = gap.angular_rate, gap.acceleration
+    noise[imu.GAP_S] = gap.longest_s if with_imu else math.inf
+    noise[imu.MEASURED] = options.imu.measured and with_imu
+    if problem.motion == "odometry":
+        noise[odometry.IS_ODOMETRY] = 1.0
+        noise[odometry.ROTATION_WALK] = math.radians(options.odometry.rotation_walk_deg)
+        noise[odometry.TRANSLATION_WALK] = options.odometry.translation_walk
+    return noise
+
+
 def _without_imu(problem: Problem, options: FuseOptions, m: memory.Memory) -> None:
     """Change what an IMU has and another source of motion has not."""
     if problem.motion in WITH_IMU:
         return
     m.start[ballot.MAX_TILT] = math.pi
-    m.noise[imu.GAP_S] = math.inf
     m.prior[GYRO_BIAS_ERROR:CORE] = 1e-9
     if problem.motion == "constant-velocity":
         m.prior[GYRO_BIAS_ERROR:ACCEL_BIAS_ERROR] = math.radians(60.0)  # minus the angular velocity
         return
-    m.noise[odometry.IS_ODOMETRY] = 1.0
-    m.noise[odometry.ROTATION_WALK] = math.radians(options.odometry.rotation_walk_deg)
-    m.noise[odometry.TRANSLATION_WALK] = options.odometry.translation_walk
     m.prior[VELOCITY_ERROR:GYRO_BIAS_ERROR] = VELOCITY_OF_ODOMETRY
 
 

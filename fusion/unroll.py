@@ -83,7 +83,7 @@ def _scale(information: Array, gradient: Array, n: int, i: int, factor: float) -
 
 @njit(cache=True)
 def _step_transposed_times(record: Array, at_gravity: int, X: Array, columns: int, push: Array) -> None:
-    """X <- F^T X for the transition F of an IMU step (`imu._rows_times`); gravity's rows stand at at_gravity."""
+    """X <- F^T X for the transition F of an IMU step (`imu.rows_times`); gravity's rows stand at at_gravity."""
     dt, blocks, basis = record[0], record[1:46], record[46:52]
     for i in range(3):
         for j in range(columns):

@@ -260,7 +260,7 @@ def test_a_graph_that_starts_from_a_filter_on_its_way_knows_all_that_it_knows():
     A[free], A[:, free] = 0.0, 0.0
     A[free, free] = np.diag([0.1, 0.2, 0.3, 0.4, 0.5, 0.6])
     P = A @ A.T
-    builder = GraphBuilder(layout, x, np.zeros(14), MotionChain.of(problem, FuseOptions()), QUIET, fixed=True)
+    builder = GraphBuilder(layout, x, np.zeros(14), MotionChain.of(problem, FuseOptions()), QUIET)
     builder.start(int(problem.imu.stamps_ns[3]), x, P, np.ones(2))
     graph, values, _ = builder.take()
     tree = graph.linearize(values).eliminateMultifrontal(gtsam.Ordering.OrderingType.COLAMD, gtsam.EliminateQR)
