@@ -38,7 +38,8 @@ HEAD = """# Options
 
 Made from the dataclasses when the documentation is built. An option `group.name` is written `--group.name` on the
 command line (`_` becomes `-`) and as the field of a dataclass in Python. An unknown option is an error,
-and so is one that nothing reads with the estimator, the measurements, the map and the motion that were chosen.
+and so is one that nothing reads with what else was chosen: the mode of the solver, the estimator, the measurements,
+the map, the motion, the noise of a simulation, the images, the start or the preset of a training.
 """
 
 

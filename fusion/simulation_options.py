@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Literal
+from typing import Any, Literal
 
 from fusion.detection_errors import NetworkErrors, WhiteErrors
+from poet_loc.core import unread_options
 from poet_loc.core.input_error import InputError, within
 from poet_loc.core.records import ImuNoise
+from poet_loc.core.unread_options import Rule
 
 
 @dataclass(frozen=True)
@@ -129,3 +132,30 @@ _SIZES = (
     "imu_noise.gyroscope_random_walk",
     "imu_noise.accelerometer_random_walk",
 )
+
+
+def refuse_unread(options: SimulationOptions) -> None:
+    """Raise InputError for an option that is not at its default although nothing reads it."""
+    unread_options.refuse_unread(options, SimulationOptions(), [options], RULES)
+
+
+def _asked(ask: Callable[[SimulationOptions], Any]) -> Callable[[SimulationOptions], bool]:
+    return lambda options: bool(ask(options))
+
+
+RULES: tuple[Rule[SimulationOptions], ...] = (
+    Rule("white.*", "noise white", _asked(lambda o: o.noise == "white" or (o.noise == "none" and o.covariances))),
+    Rule("network.*", "noise network", _asked(lambda o: o.noise == "network")),
+    Rule("network.gross_run_s", "network.gross-share", _asked(lambda o: o.network.gross_share)),
+    Rule(
+        "network.flip_run_s",
+        "a network.flip-share of symmetric objects",
+        _asked(lambda o: o.network.flip_share and o.symmetric_objects),
+    ),
+    Rule("network.dropout_run_s", "network.dropout-share", _asked(lambda o: o.network.dropout_share)),
+    Rule("gyroscope_bias_sigma accelerometer_bias_sigma", "imu-errors", _asked(lambda o: o.imu_errors)),
+    Rule("moved.[!o]*", "moved.object", _asked(lambda o: o.moved.object >= 0)),
+    Rule("camera_pose_*", "camera-poses", _asked(lambda o: o.camera_poses)),
+    Rule("odometry_*", "odometry", _asked(lambda o: o.odometry)),
+)
+"""Who reads what."""

@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, fields, is_dataclass
-from fnmatch import fnmatch
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 from fusion.motion_source import Kind
 from fusion.options import FuseOptions
 from fusion.prepare import WITH_IMU, re_estimates
-from poet_loc.core.input_error import InputError
+from poet_loc.core import unread_options
+from poet_loc.core.unread_options import Rule
 
 
 @dataclass(frozen=True)
@@ -26,41 +26,9 @@ class Reader:
     """Where it fuses objects: some detections bring a covariance."""
 
 
-@dataclass(frozen=True)
-class Rule:
-    """Options by their dotted names, with * for any, and who reads them."""
-
-    names: str
-    by: str
-    read: Callable[[Reader], bool]
-
-    def covers(self, name: str) -> bool:
-        """Tell whether the rule is about an option."""
-        return any(fnmatch(name, each) for each in self.names.split())
-
-
 def refuse_unread(options: FuseOptions, readers: Sequence[Reader]) -> None:
     """Raise InputError for an option that is not at its default although none of the estimates reads it."""
-    for name in changed(options, FuseOptions()):
-        rules = [rule for rule in RULES if rule.covers(name)]
-        unmet = [[rule for rule in rules if not rule.read(reader)] for reader in readers]
-        if not all(unmet):
-            continue
-        typed = name.replace("_", "-")
-        if not readers:
-            raise InputError(f"{typed} changes nothing: nothing is fused", fix="leave it out")
-        by = min(unmet, key=len)[0].by
-        raise InputError(f"{typed} changes nothing here", fix=f"it goes with {by}: choose that, or leave it out")
-
-
-def changed(options: object, default: object) -> Iterator[str]:
-    """Yield the dotted names of what is not at its default in a record of options and in the records inside it."""
-    for each in fields(options):  # type: ignore[arg-type]
-        value, usual = getattr(options, each.name), getattr(default, each.name)
-        if is_dataclass(value):
-            yield from (f"{each.name}.{name}" for name in changed(value, usual))
-        elif value != usual:
-            yield each.name
+    unread_options.refuse_unread(options, FuseOptions(), readers, RULES, "nothing is fused")
 
 
 def _estimator(*names: str) -> Callable[[Reader], bool]:
@@ -84,7 +52,7 @@ _OF_OBJECTS = (
     "gate.adaptation gate.max_noise_scale start.min_objects start.min_places"
 )
 
-RULES = (
+RULES: tuple[Rule[Reader], ...] = (
     Rule("graph.*", "the estimators graph and batch", _estimator("graph", "batch")),
     Rule("graph.gnc graph.max_iterations graph.rounds", "the estimator batch", _estimator("batch")),
     Rule("graph.lag_s graph.relinearize*", "the estimator graph", _estimator("graph")),
@@ -116,4 +84,4 @@ RULES = (
         _asked(lambda o: o.start.pose is None),
     ),
 )
-"""Who reads what; an option that no rule names is read by all. An estimate reads what all its rules let it read."""
+"""Who reads what."""

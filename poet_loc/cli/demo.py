@@ -6,6 +6,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from fusion.simulate import SimulationOptions, simulate
+from landmarks.options import MODES
 from poet_loc.cli.estimates import FUSIONS, StageOptions, estimate_log, refuse_one_estimator, steps
 from poet_loc.cli.run import show
 from poet_loc.cli.run_folder import WRITING_STEPS, write_run
@@ -47,7 +48,7 @@ def execute(arguments: Arguments) -> None:
     place, run = arguments.out / "log", arguments.out / "run"
     with whole_folder(arguments.out, arguments.overwrite) as folder:
         log = replace(_simulated(folder, arguments) if arguments.simulated else _seen(folder, arguments), path=place)
-        refuse_unread(arguments.options.fusion, FUSIONS, [log], arguments.options.solver.mode)
+        refuse_unread(arguments.options, [log], MODES, FUSIONS)
     with whole_folder(run) as folder, progress(steps() + WRITING_STEPS) as report:
         estimates = estimate_log(log, None, arguments.options, report)
         write_run(folder, estimates, arguments, report, arguments.pictures, arguments.paper)

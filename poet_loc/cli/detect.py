@@ -36,8 +36,10 @@ class Arguments:
 def execute(arguments: Arguments) -> None:
     """Detect and say what came out."""
     from poet_loc.detect.stage import detect, detect_in_log
+    from poet_loc.detect.unread_options import refuse_unread
     from poet_loc.io.object_poses_csv import read_object_poses
 
+    refuse_unread(arguments.source, arguments.options)
     if arguments.out is None:
         if arguments.options.overlays or arguments.recording:
             raise InputError("overlays and recordings need a folder of their own", fix="give --out FOLDER")

@@ -11,6 +11,7 @@ import tyro
 
 from poet_loc.cli.arguments import Flat
 from poet_loc.cli.terminal import print_tables
+from poet_loc.core.input_error import InputError
 from poet_loc.io.whole_folder import whole_folder
 from poet_loc.report.pose_evaluation import evaluate_poses
 from poet_loc.report.pose_inputs import EvaluatePosesOptions
@@ -34,6 +35,8 @@ class Arguments:
 
 def execute(arguments: Arguments) -> None:
     """Print the tables, and write them where asked."""
+    if arguments.options.scene is not None and not any(path.suffix == ".json" for path in arguments.results):
+        raise InputError("--scene changes nothing: BOP results tell theirs", fix="leave it out")
     found = evaluate_poses(arguments.results, arguments.truth, arguments.options)
     tables = pose_tables(found)
     print_tables(tables)

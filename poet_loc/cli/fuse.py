@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from fusion.options import FuseOptions
@@ -44,11 +44,13 @@ class Arguments:
 def execute(arguments: Arguments) -> None:
     """Fuse, print the table and name the files."""
     options = with_noise_from(arguments.noise_from, arguments.options)
-    stages = StageOptions(solver=SolverOptions(mode=arguments.mode), fusion=options)
+    typed = StageOptions(solver=SolverOptions(mode=arguments.mode), fusion=arguments.options)
+    stages = replace(typed, fusion=options)
+    named = () if arguments.detections is None else (arguments.detections,)
     with whole_folder(arguments.out, arguments.overwrite, inputs=[arguments.log]) as folder:
         log = read_log(arguments.log, arguments.detections)
         fusions = (fusion_of(options),)
-        refuse_unread(arguments.options, fusions, [log], arguments.mode, arguments.noise_from, arguments.detections)
+        refuse_unread(typed, [log], (), fusions, named, arguments.noise_from)
         solve = options.measurements == "camera" and log.camera_poses is None
         modes = (arguments.mode,) if solve else ()
         with progress(steps(modes, fusions) + WRITING_STEPS) as report:

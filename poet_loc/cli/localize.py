@@ -11,6 +11,7 @@ from poet_loc.cli.estimates import StageOptions, estimate_log, steps
 from poet_loc.cli.run import show
 from poet_loc.cli.run_folder import WRITING_STEPS, write_run
 from poet_loc.cli.terminal import progress
+from poet_loc.cli.unread import refuse_unread_by_solver
 from poet_loc.io.log_folder import read_log
 from poet_loc.io.whole_folder import whole_folder
 
@@ -37,7 +38,8 @@ def execute(arguments: Arguments) -> None:
     options = arguments.options
     with whole_folder(arguments.out, arguments.overwrite, inputs=[arguments.log]) as folder:
         log = read_log(arguments.log, options.detections)
-        log.detections(options.detections)
+        name, _ = log.detections(options.detections)
+        refuse_unread_by_solver(options, [log], (options.mode,), (name,))
         with progress(steps((options.mode,), ()) + WRITING_STEPS) as report:
             stages = StageOptions(solver=options)
             estimates = estimate_log(log, options.detections, stages, report, (options.mode,), (), strict=True)

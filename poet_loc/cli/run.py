@@ -47,14 +47,8 @@ def execute(arguments: Arguments) -> None:
     refuse_one_estimator(fusion)
     with whole_folder(arguments.out, arguments.overwrite, inputs=[arguments.log]) as folder:
         log = read_log(arguments.log, arguments.detections)
-        refuse_unread(
-            arguments.options.fusion,
-            arguments.fusions,
-            [log],
-            arguments.options.solver.mode,
-            arguments.noise_from,
-            arguments.detections,
-        )
+        named = () if arguments.detections is None else (arguments.detections,)
+        refuse_unread(arguments.options, [log], MODES, arguments.fusions, named, arguments.noise_from)
         stages = replace(arguments.options, fusion=fusion)
         with progress(steps(MODES, arguments.fusions) + WRITING_STEPS) as report:
             estimates = estimate_log(log, arguments.detections, stages, report, MODES, arguments.fusions)

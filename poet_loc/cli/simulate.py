@@ -11,6 +11,7 @@ import numpy as np
 
 from fusion.monte_carlo import simulate_runs
 from fusion.simulate import SimulationOptions, simulate
+from fusion.simulation_options import refuse_unread as refuse_unread_by_simulation
 from landmarks.options import Mode
 from poet_loc.cli.arguments import Flat
 from poet_loc.cli.estimates import FUSIONS, Fusion, StageOptions, estimate_log, refuse_one_estimator
@@ -53,6 +54,7 @@ def execute(arguments: Arguments) -> None:
     processes("workers", arguments.workers)
     if arguments.out is None and arguments.runs < 1:
         raise InputError("nothing to do", fix="give --out LOG, --runs N, or both")
+    refuse_unread_by_simulation(arguments.simulation)
     _refuse_unread(arguments)
     if arguments.out is not None:
         with whole_folder(arguments.out, arguments.overwrite) as folder:
@@ -65,8 +67,7 @@ def execute(arguments: Arguments) -> None:
 def _refuse_unread(arguments: Arguments) -> None:
     """Raise InputError for options that the log, or the runs, do not read."""
     if arguments.runs > 0:
-        options, log = arguments.options, simulate(arguments.simulation)
-        refuse_unread(options.fusion, arguments.fusions, [log], options.solver.mode)
+        refuse_unread(arguments.options, [simulate(arguments.simulation)], arguments.modes, arguments.fusions)
         return
     usual = Arguments()
     for name in ("modes", "fusions", "workers", "cluster", "options"):

@@ -88,7 +88,7 @@ def _refuse_unread(arguments: Arguments, logs: Sequence[Log]) -> None:
     if arguments.fusions != FUSIONS and not arguments.with_fusion:
         raise InputError("--fusions changes nothing without --with-fusion", fix="add it")
     fusions = arguments.fusions if arguments.with_fusion else ()
-    refuse_unread(arguments.options.fusion, fusions, logs, arguments.options.solver.mode)
+    refuse_unread(arguments.options, logs, arguments.modes, fusions, arguments.detections)
 
 
 def _form(arguments: Arguments) -> Format:

@@ -10,6 +10,7 @@ from typing import Any, Literal
 from poet_loc.cli.arguments import Flat
 from poet_loc.core.input_error import InputError
 from poet_loc.train.options import RECIPES, TrainOptions
+from poet_loc.train.unread_options import refuse_unread
 
 
 @dataclass(frozen=True)
@@ -20,8 +21,8 @@ class Arguments:
     preset: Literal["paper", "code", "ycbv", "embedded"] | None = None
     """Published recipe: of the paper, of the official code, or what its authors gave for YCB-V.  It replaces the
     optimiser's and the loss's options that were left at their defaults.  embedded: the network that comes with the
-    package, from rendering to calibration; of the options it reads out, data.train (the split train of the rendered
-    data set, made where it is missing), recipe.batch, seed and max_steps, and it always resumes."""
+    package, from rendering to calibration; it takes out, data.train (the split train of the rendered data set, made
+    where it is missing), recipe.batch, seed and max_steps alone, and it always resumes."""
 
 
 def execute(arguments: Arguments) -> None:
@@ -29,6 +30,7 @@ def execute(arguments: Arguments) -> None:
     from poet_loc.train.pose_training import train
 
     options = arguments.options
+    refuse_unread(options, arguments.preset == "embedded")
     if arguments.preset == "embedded":
         print(_train_embedded(options))
         return

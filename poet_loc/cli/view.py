@@ -35,6 +35,10 @@ def execute(arguments: Arguments) -> None:
     recordings = [_recording(run) for run in arguments.runs]
     if not recordings:
         raise InputError("no run was named", fix="poet-loc view RUN [RUN ..]")
+    if arguments.save is None and arguments.overwrite:
+        raise InputError("--overwrite changes nothing without --save", fix="leave it out")
+    if arguments.save is not None and arguments.web:
+        raise InputError("--save opens nothing, --web does", fix="leave out one of them")
     if arguments.save is not None:
         _save(arguments, recordings)
         return

@@ -67,7 +67,7 @@ class TrainOptions:
     data: DataOptions
     recipe: RecipeOptions = field(default_factory=RecipeOptions)
     network: NetworkOptions = field(default_factory=NetworkOptions)
-    """Ignored with `start`, whose file holds its own."""
+    """Not with `start`, whose file holds its own."""
     loss: LossOptions = field(default_factory=LossOptions)
     augmentation: AugmentationOptions = field(default_factory=AugmentationOptions)
     start: Path | None = None

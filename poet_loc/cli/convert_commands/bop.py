@@ -10,7 +10,14 @@ import numpy as np
 import tyro
 
 from poet_loc.cli.arguments import Flat, OutFolder
+from poet_loc.core.unread_options import Rule, refuse_unread
 from poet_loc.io.convert_bop import BopConversion, ConvertBopOptions, convert_bop
+
+RULES: tuple[Rule[ConvertBopOptions], ...] = (
+    Rule("frame_rate", "images without --stamps", lambda options: options.stamps is None),
+    Rule("min_visible", "the ground truth, not --results", lambda options: options.results is None),
+)
+"""Who reads what."""
 
 
 @dataclass(frozen=True)
@@ -26,6 +33,7 @@ class Arguments:
 
 def execute(arguments: Arguments) -> None:
     """Convert and say what each scene became."""
+    refuse_unread(arguments.options, ConvertBopOptions(), [arguments.options], RULES)
     print(_told(convert_bop(arguments.root, arguments.out, arguments.options)))
 
 
