@@ -29,6 +29,14 @@ class Columns(NamedTuple):
     nis: Array  # (M, 3) both, rotation, position
 
 
+class Fitted(NamedTuple):
+    """Each measurement as the filter used it (symmetry chosen, noise scaled), and what a robust kernel gives it."""
+
+    rotations: Array  # (M, 9)
+    covariances: Array  # (M, 6, 6)
+    weights: Array  # (M,) at the state that knows the measurement
+
+
 class Rows(NamedTuple):
     """What the filter knew over time."""
 

@@ -12,10 +12,10 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
-from fusion.columns import Columns
+from fusion.columns import Columns, Fitted
 from fusion.eskf import ACCEPTED
 from fusion.graph_builder import GraphBuilder
-from fusion.graph_linear import linearise
+from fusion.graph_linear import bias_rows, linearise
 from fusion.graph_link import LINK_SIZES, link_keyframes
 from fusion.graph_motion import MotionChain
 from fusion.graph_variables import (
@@ -35,8 +35,6 @@ from fusion.nav_state import StateLayout
 from fusion.options import Graph
 
 Array = NDArray[np.float64]
-
-_SIX = range(6)
 
 
 def linear_factor(rows: Array, keys: Sequence[int], sizes: Sequence[int]) -> gtsam.NonlinearFactor:
@@ -67,27 +65,17 @@ class FixedBuilder(GraphBuilder):
     def _bias_factor(
         self, before: int, variable: Variable, phi: Array, sigma: Array, began: Array
     ) -> gtsam.NonlinearFactor:
-        rows = np.zeros((6, 13))
-        rows[_SIX, _SIX], rows[_SIX, range(6, 12)] = -phi / sigma, 1.0 / sigma
-        rows[:, 12] = (phi * began - self.x[variable.place]) / sigma
+        rows = bias_rows(phi, sigma, began, self.x[variable.place])
         return linear_factor(rows, (before, variable.key), (6, 6))
 
-    def add_linearised(
-        self, columns: Columns, rotations: Array, covariances: Array, weights: Array, which: range
-    ) -> None:
-        """Add measurements that passed the gate to the newest keyframe.
-
-        rotations and covariances are those that the filter used, weights those that the kernel gives.
-        """
-        c, chain, every = columns, self.chain, slice(which.start, which.stop)
-        passed = ((c.decisions[every] & ACCEPTED) * (c.kinds[every] == OBJECT_POSE)).tolist()
-        seen = sorted({k for k, rows in zip(c.objects[every].tolist(), passed, strict=True) if rows})
+    def add_linearised(self, log: Columns, fitted: Fitted, which: range) -> None:
+        """Add measurements that passed the gate to the newest keyframe, as the filter used them."""
+        parts = (column[which.start : which.stop].tolist() for column in (log.kinds, log.objects, log.decisions))
+        seen = sorted({k for kind, k, rows in zip(*parts, strict=True) if kind == OBJECT_POSE and rows & ACCEPTED})
         private = [self._private_keys(k) for k in seen]
-        measured = c.stamps, c.kinds, c.objects, rotations, c.translations, covariances, c.decisions, weights
-        motion = self.stamp_ns, chain.stamps_ns, chain.values, not chain.with_imu
-        where = self.x, self.origin, self.model.integers
-        rows, begins = linearise(which.start, which.stop, *measured, *motion, *where)
-        keys, sizes = self._common(int(c.stamps[which.start]) != self.stamp_ns)
+        motion, where = (self.stamp_ns, not self.chain.with_imu), (self.x, self.origin, self.model.integers)
+        rows, begins = linearise(log, fitted, which.start, which.stop, *motion, *where)
+        keys, sizes = self._common(int(log.stamps[which.start]) != self.stamp_ns)
         first = [int(begins[k]) for k in seen]
         for own, begin, end in zip(private, first, [*first, len(rows)][1:], strict=True):  # what all share is behind
             self.graph.add(linear_factor(rows[begin:end], own + keys, [6] * len(own) + sizes))

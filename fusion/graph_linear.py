@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from fusion.columns import Columns, Fitted
 from fusion.compiled import njit
 from fusion.eskf import ACCEPTED, POSITION_ONLY, ROTATION_ONLY, cholesky
 from fusion.graph_model import (
@@ -43,19 +44,11 @@ _NOTHING = 1e-10  # of a column's length: what rounding leaves of it
 
 @njit(cache=True, _nrt=True)
 def linearise(
+    log: Columns,
+    fitted: Fitted,
     first: int,
     end: int,
-    stamps: Ints,
-    kinds: Ints,
-    objects: Ints,
-    rotations: Array,
-    translations: Array,
-    covariances: Array,
-    decisions: Ints,
-    weights: Array,
     keyframe_ns: int,
-    motion_stamps: Ints,
-    motion_values: Array,
     odometry: bool,
     now: Array,
     start: Array,
@@ -63,40 +56,40 @@ def linearise(
 ) -> tuple[Array, Ints]:
     """Linearise the measurements first..end-1 that passed the gate at a nominal array `start`, whitened and weighted.
 
-    The motion from the keyframe is integrated at the biases in the nominal array `now`; the object biases there are
-    where their part is linearised, as they may have begun far from it, and the right-hand side is brought to `start`.
-    Returns rows [A, b] with the columns that `columns_of` names, and where those of each object begin (K + 1,); those
-    behind have nothing in the columns that belong to an object.
+    fitted says how the filter used them. The motion from the keyframe is integrated at the biases in the nominal array
+    `now`; the object biases there are where their part is linearised, as they may have begun far from it, and the
+    right-hand side is brought to `start`. Returns rows [A, b] with the columns that `columns_of` names, and where those
+    of each object begin (K + 1,); those behind have nothing in the columns that belong to an object.
     """
     biases, x = now[GYRO_BIAS : ACCEL_BIAS + 3] if not odometry else np.zeros(6), np.empty(len(start))
-    columns = columns_of(layout, not odometry and (layout[AT_TIME_OFFSET] >= 0 or stamps[first] != keyframe_ns))
+    columns = columns_of(layout, not odometry and (layout[AT_TIME_OFFSET] >= 0 or log.stamps[first] != keyframe_ns))
     rows, owners, count = np.empty((6 * (end - first), len(columns) + 1)), np.empty(6 * (end - first), np.int64), 0
     here = np.copy(start)
     for i in range(3 if odometry else 0):  # it knows no velocity
         here[VELOCITY + i] = 0.0
     copy(now[layout[BIASES] :], here[layout[BIASES] :])
     for i in range(first, end):
-        passed = decisions[i] & ACCEPTED
-        if passed == 0 or kinds[i] == ODOMETRY_STEP:
+        passed, kind, k = log.decisions[i] & ACCEPTED, log.kinds[i], log.objects[i]
+        if passed == 0 or kind == ODOMETRY_STEP:
             continue
         above, below = 0 if passed & ROTATION_ONLY else 3, 6 if passed & POSITION_ONLY else 3
-        motion = motion_between(motion_stamps, motion_values, keyframe_ns, stamps[i], biases, odometry)
-        rate = rate_at(motion_stamps, motion_values, stamps[i], biases[0:3])
+        motion = motion_between(log.imu_stamps, log.imu_values, keyframe_ns, log.stamps[i], biases, odometry)
+        rate = rate_at(log.imu_stamps, log.imu_values, log.stamps[i], biases[0:3])
         copy(here, x)
-        seen = kinds[i], objects[i], above, below - above, rotations[i], translations[i]
+        seen = kind, k, above, below - above, fitted.rotations[i], log.translations[i]
         e, J = error_and_jacobian(*seen, rate, motion, x, layout)
-        if kinds[i] == OBJECT_POSE:
-            _bring_to(start, now, objects[i], J, e, layout)
+        if kind == OBJECT_POSE:
+            _bring_to(start, now, k, J, e, layout)
         own = rows[count : count + len(e)]
         for r in range(len(e)):
-            owners[count + r] = objects[i] if kinds[i] == OBJECT_POSE else -1
+            owners[count + r] = k if kind == OBJECT_POSE else -1
             own[r, -1] = -e[r]
             for c in range(len(columns)):
                 own[r, c] = J[r, columns[c]]
-        whiten_rows(covariances[i], above, own)
+        whiten_rows(fitted.covariances[i], above, own)
         for r in range(len(e)):
             for c in range(own.shape[1]):
-                own[r, c] *= np.sqrt(weights[i])
+                own[r, c] *= np.sqrt(fitted.weights[i])
         count += len(e)
     return _compress(rows[:count], owners[:count], layout[N_OBJECTS], private_size(layout))
 
@@ -179,6 +172,19 @@ def _compress(rows: Array, owners: Ints, n_objects: int, private: int) -> tuple[
         copy(shared[r], turned[count])
         count += 1
     return turned[:count], begins
+
+
+@njit(cache=True, _nrt=True)
+def bias_rows(phi: Array, sigma: Array, first: Array, second: Array) -> Array:
+    """Return the Gauss-Markov step second = phi first + w, w ~ sigma, between two object biases as rows [A, b] (6, 13).
+
+    All (6,); both biases are linearised at what is given.
+    """
+    rows = np.zeros((6, 13))
+    for i in range(6):
+        rows[i, i], rows[i, 6 + i] = -phi[i] / sigma[i], 1.0 / sigma[i]
+        rows[i, 12] = (phi[i] * first[i] - second[i]) / sigma[i]
+    return rows
 
 
 @njit(cache=True)

@@ -22,7 +22,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation
 
 from fusion import memory
-from fusion.columns import Columns
+from fusion.columns import Columns, Fitted
 from fusion.fuse import loop_columns
 from fusion.graph_fixed import new_builder
 from fusion.graph_motion import MotionChain
@@ -82,7 +82,7 @@ class GraphEstimator(Estimator):
         poses = int(seconds * self.online.max_pose_rate_hz)
         samples = int(seconds * self.online.max_imu_rate_hz)
         self._room, self._walk.out = loop_columns(_room_for(self._problem, samples, poses))
-        self._fitted = np.zeros((poses, 9)), np.zeros((poses, 6, 6)), np.zeros(poses)
+        self._fitted = Fitted(np.zeros((poses, 9)), np.zeros((poses, 6, 6)), np.zeros(poses))
         self._samples = self._poses = 0
         self._rate, self._force = np.zeros(3), np.zeros(3)
         self._chain = MotionChain.of(self._problem, self.options)
@@ -179,7 +179,7 @@ class GraphEstimator(Estimator):
         walk, room, n, m = self._walk, self._room, self._samples, self._poses
         filled: list[Any] = [column[: n if i < 2 else m] for i, column in enumerate(room)]
         walk.columns = Columns(*filled)
-        walk.rotations, walk.covariances, walk.weights = (column[:m] for column in self._fitted)
+        walk.fitted = Fitted(*(column[:m] for column in self._fitted))
         if not walk.begun:
             walk.begin()
             self._keep()

@@ -226,7 +226,7 @@ def add_measurements(builder: GraphBuilder, walk: Walk, which: range) -> None:
     whole = c.stamps[which[0]] == builder.stamp_ns and not (layout.extrinsics or layout.time_offset)
     native = whole and CAMERA_POSE in c.kinds[which.start : which.stop].tolist()  # gtsam has a factor for it
     if isinstance(builder, FixedBuilder) and not native:
-        builder.add_linearised(c, walk.rotations, walk.covariances, walk.weights, which)
+        builder.add_linearised(c, walk.fitted, which)
     else:
         builder.add_detections(detections(builder, walk, which))
 
@@ -248,9 +248,9 @@ def detection_of(builder: GraphBuilder, walk: Walk, i: int, keyframe_ns: int, x:
         k,
         first,
         end - first,
-        walk.rotations[i].copy(),
+        walk.fitted.rotations[i].copy(),
         c.translations[i].copy(),
-        walk.covariances[i].copy(),
+        walk.fitted.covariances[i].copy(),
         motion,
         chain.rate(stamp, x),
         stamp != keyframe_ns,

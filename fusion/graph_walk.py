@@ -5,11 +5,12 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
 from fusion import memory
-from fusion.columns import Columns, Rows, read_fitted
+from fusion.columns import Columns, Fitted, Rows, read_fitted
 from fusion.compiled import njit
 from fusion.eskf import ACCEPTED, POSITION_ONLY, ROTATION_ONLY, cholesky, whiten
 from fusion.filter_loop import emit, end_of_stamp, measure
@@ -22,10 +23,11 @@ from fusion.options import FuseOptions
 from fusion.prepare import Problem, fill_memory
 from fusion.so3_kernels import copy
 
-# Places in the cursor: next IMU row, next measurement, rows written, stamp of the newest keyframe.
-IMU_ROW, NEXT, ROWS, KEYFRAME_NS, CURSOR_SIZE = range(5)
+# Places in the cursor: next IMU row, next measurement, rows written, stamp of the newest keyframe, first measurement at
+# the last stamp with any; 1 where the newest row is to be written again, 1 where an object's bias has just jumped.
+IMU_ROW, NEXT, ROWS, KEYFRAME_NS, HERE, CORRECTED, JUMPED, CURSOR_SIZE = range(8)
 
-END, KEYFRAME, STARTED = range(3)  # why filter_until_keyframe returned
+ON_THE_WAY, KEYFRAME, STARTED, END = range(4)  # where the filter is
 
 NO_KERNEL, HUBER, CAUCHY = range(3)
 KERNELS = {"none": NO_KERNEL, "huber": HUBER, "cauchy": CAUCHY}
@@ -42,80 +44,94 @@ def begin_log(floats: Array, integers: Ints, cursor: Ints, imu_stamps: Ints, imu
     begin(m, imu_stamps[0], imu_values[0, 3:6], 0)
 
 
+class Spacing(NamedTuple):
+    """When a keyframe is due, and what weighs its measurements."""
+
+    every_ns: int  # at the first stamp with measurements so long after the last one
+    idle_ns: int  # at an IMU sample so long after it
+    kernel: int
+    width: float
+
+
 @njit(cache=True)
 def filter_until_keyframe(
     floats: Array,
     integers: Ints,
     cursor: Ints,
-    spacing_ns: int,
-    idle_ns: int,
+    spacing: Spacing,
     log: Columns,
-    fitted_rotations: Array,
-    fitted_covariances: Array,
-    weights: Array,
-    kernel: int,
-    width: float,
+    fitted: Fitted,
     fresh: Array,
     rows: Rows,
 ) -> int:
     """Filter up to the next keyframe and return KEYFRAME, STARTED where the filter (re)started or put an object
     elsewhere there, or END.
 
-    A keyframe is due at the first stamp with measurements spacing_ns after the last one, where an object's bias jumped,
-    wherever odometry is measured, and at an IMU sample idle_ns after the last one. Its own measurements are taken in.
-    fitted_rotations and fitted_covariances get each measurement as it was used (symmetry chosen, noise scaled), weights
-    what a robust kernel gives it at the state that knows it; fresh (2, kinds * objects * 2 halves) tells of each bias
-    its variance where nothing ties it to the motion, else 0, and whether it has just been forgotten.
+    A keyframe is due where `spacing` says so, where an object's bias jumped, and wherever odometry is measured. Its own
+    measurements are taken in. fresh (2, kinds * objects * 2 halves) tells of each bias its variance where nothing ties
+    it to the motion, else 0, and whether it has just been forgotten.
     """
     m = views(floats, integers)
     w = work_views(m.work, len(m.P))
-    imu_stamps, stamps = log.imu_stamps, log.stamps
-    while cursor[IMU_ROW] < len(imu_stamps):
+    if cursor[CORRECTED] == 1:
+        emit(m, rows, cursor[ROWS] - 1)
+    cursor[CORRECTED] = cursor[JUMPED] = 0
+    while cursor[IMU_ROW] < len(log.imu_stamps):
         k, j = cursor[IMU_ROW], cursor[NEXT]
-        if j < len(stamps) and stamps[j] <= imu_stamps[k]:
-            restarts, tracked = m.counters[RESTARTS] + m.counters[REPLACED], m.counters[MODE] == TRACKING
-            last = end_of_stamp(stamps, j, len(stamps))
-            advance(m, w, imu_stamps, log.imu_values, stamps[j])
-            find_rate(m, w, imu_stamps, log.imu_values)
-            measure(m, w, log, j, last)
-            cursor[NEXT] = last
-            if m.counters[MODE] != TRACKING:
-                continue
-            _write_row(m, cursor, rows)
-            for i in range(j, last):
-                read_fitted(m, w, log, i)
-                copy(w.measured, fitted_rotations[i])
-                copy(w.R.reshape(36), fitted_covariances[i].reshape(36))
-                weights[i] = _weight(m, w, log, i, kernel, width)
-            jumped = _find_fresh(m, fresh)
-            if not tracked or m.counters[RESTARTS] + m.counters[REPLACED] != restarts:
-                cursor[KEYFRAME_NS] = m.counters[NOW]
-                return STARTED
-            if jumped or log.kinds[j] == ODOMETRY_STEP or m.counters[NOW] - cursor[KEYFRAME_NS] >= spacing_ns:
-                cursor[KEYFRAME_NS] = m.counters[NOW]
-                return KEYFRAME
-            continue
-        advance(m, w, imu_stamps, log.imu_values, imu_stamps[k])
-        cursor[IMU_ROW] += 1
-        if m.counters[MODE] == TRACKING:
-            if cursor[ROWS] == 0 or rows.stamps[cursor[ROWS] - 1] != m.counters[NOW]:
-                _write_row(m, cursor, rows)
-            if m.counters[NOW] - cursor[KEYFRAME_NS] >= idle_ns:
-                cursor[KEYFRAME_NS] = m.counters[NOW]
-                return KEYFRAME
+        if j < len(log.stamps) and log.stamps[j] <= log.imu_stamps[k]:
+            where = _go_to_measurements(m, w, cursor, spacing, log, fitted, fresh, rows)
+        else:
+            where = _go_to_sample(m, w, cursor, spacing, log, rows)
+        if where != ON_THE_WAY:
+            cursor[KEYFRAME_NS] = m.counters[NOW]
+            return where
     return END
+
+
+@njit(cache=True)
+def _go_to_measurements(
+    m: Memory, w: Work, cursor: Ints, spacing: Spacing, log: Columns, fitted: Fitted, fresh: Array, rows: Rows
+) -> int:
+    """Filter up to the next stamp with measurements and take these in; return what the filter has come to."""
+    first, c = cursor[NEXT], m.counters
+    last = end_of_stamp(log.stamps, first, len(log.stamps))
+    restarts, tracked = c[RESTARTS] + c[REPLACED], c[MODE] == TRACKING
+    advance(m, w, log.imu_stamps, log.imu_values, log.stamps[first])
+    find_rate(m, w, log.imu_stamps, log.imu_values)
+    measure(m, w, log, first, last)
+    cursor[HERE], cursor[NEXT] = first, last
+    if c[MODE] != TRACKING:
+        return ON_THE_WAY
+    _write_row(m, cursor, rows)
+    for i in range(first, last):
+        read_fitted(m, w, log, i)
+        copy(w.measured, fitted.rotations[i])
+        copy(w.R.reshape(36), fitted.covariances[i].reshape(36))
+        fitted.weights[i] = _weight(m, w, log, i, spacing.kernel, spacing.width)
+    cursor[JUMPED] = 1 if _find_fresh(m, fresh) else 0
+    if not tracked or c[RESTARTS] + c[REPLACED] != restarts:
+        return STARTED
+    due = cursor[JUMPED] == 1 or log.kinds[first] == ODOMETRY_STEP
+    return KEYFRAME if due or c[NOW] - cursor[KEYFRAME_NS] >= spacing.every_ns else ON_THE_WAY
+
+
+@njit(cache=True)
+def _go_to_sample(m: Memory, w: Work, cursor: Ints, spacing: Spacing, log: Columns, rows: Rows) -> int:
+    """Filter up to the next IMU sample; return what the filter has come to."""
+    c = m.counters
+    advance(m, w, log.imu_stamps, log.imu_values, log.imu_stamps[cursor[IMU_ROW]])
+    cursor[IMU_ROW] += 1
+    if c[MODE] != TRACKING:
+        return ON_THE_WAY
+    if cursor[ROWS] == 0 or rows.stamps[cursor[ROWS] - 1] != c[NOW]:
+        _write_row(m, cursor, rows)
+    return KEYFRAME if c[NOW] - cursor[KEYFRAME_NS] >= spacing.idle_ns else ON_THE_WAY
 
 
 @njit(cache=True)
 def _write_row(m: Memory, cursor: Ints, rows: Rows) -> None:
     emit(m, rows, cursor[ROWS])
     cursor[ROWS] += 1
-
-
-@njit(cache=True)
-def rewrite_row(floats: Array, integers: Ints, cursor: Ints, rows: Rows) -> None:
-    """Write the newest row again, after the graph has corrected the filter's state."""
-    emit(views(floats, integers), rows, cursor[ROWS] - 1)
 
 
 @njit(cache=True)
@@ -198,13 +214,13 @@ class Walk:
         self.memory = memory.views.py_func(self.floats, self.integers)
         self.columns, self.out = loop_columns(problem)
         count = len(problem.measurements)
-        self.rotations, self.covariances, self.weights = np.zeros((count, 9)), np.zeros((count, 6, 6)), np.ones(count)
+        self.fitted = Fitted(np.zeros((count, 9)), np.zeros((count, 6, 6)), np.ones(count))
         self.cursor = np.zeros(CURSOR_SIZE, dtype=np.int64)
         self.begun, self.first = False, 0
         self.fresh = np.zeros((2, 2 * max(1, problem.layout.n_objects * problem.layout.bias_kinds)))
-        self._kernel = KERNELS[options.graph.kernel], options.graph.kernel_width
-        self._spacing_ns = round(0.999e9 / options.graph.keyframe_rate_hz)
-        self._idle_ns = round(options.graph.idle_s * 1e9)
+        graph = options.graph
+        spans = round(0.999e9 / graph.keyframe_rate_hz), round(graph.idle_s * 1e9)
+        self._spacing = Spacing(*spans, KERNELS[graph.kernel], graph.kernel_width)
 
     @property
     def rows(self) -> tuple[Ints, Array, Array, Array]:
@@ -227,32 +243,19 @@ class Walk:
 
         to_the_end: the last samples are the log's, so a keyframe is due there too.
         """
-        c, cursor, newest = self.columns, self.cursor, int(self.cursor[KEYFRAME_NS])
-        self.fresh[1] = 0.0
+        cursor, newest = self.cursor, int(self.cursor[KEYFRAME_NS])
         if not self.begun:
             self.begin()
-        event = filter_until_keyframe(
-            self.floats,
-            self.integers,
-            cursor,
-            self._spacing_ns,
-            self._idle_ns,
-            c,
-            self.rotations,
-            self.covariances,
-            self.weights,
-            *self._kernel,
-            self.fresh,
-            self.out,
-        )
+        walked = self._spacing, self.columns, self.fitted, self.fresh, self.out
+        event = filter_until_keyframe(self.floats, self.integers, cursor, *walked)
         stamp, last = int(self.memory.counters[NOW]), int(cursor[NEXT])
         if event == END:
             if not to_the_end or cursor[ROWS] == 0 or stamp == newest:
                 return None
             cursor[KEYFRAME_NS] = stamp
         first, self.first = self.first, last
-        here = first + int(np.searchsorted(c.stamps[first:last], stamp))
-        forgotten = [self._forgotten(int(half)) for half in np.flatnonzero(self.fresh[1])]
+        here = int(cursor[HERE]) if last > first and self.columns.stamps[cursor[HERE]] == stamp else last
+        forgotten = [self._forgotten(int(half)) for half in np.flatnonzero(self.fresh[1])] if cursor[JUMPED] else []
         return Keyframe(stamp, event == STARTED, forgotten, range(first, here), range(here, last))
 
     def _forgotten(self, half: int) -> Forgotten:
@@ -262,5 +265,5 @@ class Walk:
         return Forgotten(k, kind, half % 2, np.sqrt(variances[3 * (half % 2) : 3 * (half % 2) + 3]))
 
     def rewrite(self) -> None:
-        """Write the newest row again after a correction of the memory."""
-        rewrite_row(self.floats, self.integers, self.cursor, self.out)
+        """Have the newest row written again, after a correction of the memory, when the filter goes on."""
+        self.cursor[CORRECTED] = 1

@@ -120,7 +120,7 @@ def test_a_kernel_weighs_a_measurement_by_its_error_at_the_state_that_knows_it(k
             rows, (e, _) = slice(d.first, d.first + d.size), error_at(d, x, problem.layout)
             far = np.sqrt(e @ np.linalg.solve(d.covariance[rows, rows], e))
             weight = 1.0 if kernel == "none" else kernels[kernel].Create(0.8).weight(far)
-            assert walk.weights[i] == pytest.approx(weight, rel=1e-6)
+            assert walk.fitted.weights[i] == pytest.approx(weight, rel=1e-6)
             bent += far > 0.8
     assert bent > 10
 

@@ -51,20 +51,21 @@ def test_measurements_linearised_together_say_what_each_of_their_factors_says(na
         for which in (keyframe.between, keyframe.at):
             partly = rng.random(len(which)) < 0.3
             walk.columns.decisions[which.start : which.stop][partly] &= rng.integers(0, 4, partly.sum())
-        weights, covariances = rng.uniform(0.1, 1.0, len(walk.weights)), walk.covariances
+        fitted = walk.fitted
+        weights, covariances = rng.uniform(0.1, 1.0, len(fitted.weights)), fitted.covariances
         weights[walk.columns.kinds != OBJECT_POSE] = 1.0  # gtsam's own factor of a camera pose has a kernel of its own
         for builder in builders:
             builder.place_new_objects(m.x)
-            fixed = isinstance(builder, FixedBuilder)
-            walk.weights = weights if fixed else np.ones(len(weights))
-            walk.covariances = covariances if fixed else covariances / weights[:, None, None]
+            weighed = fitted._replace(weights=weights)
+            spread = fitted._replace(covariances=covariances / weights[:, None, None])
+            walk.fitted = weighed if isinstance(builder, FixedBuilder) else spread
             for which in (keyframe.between, keyframe.at):
                 add_measurements(builder, walk, which)
                 if which is keyframe.between:
                     count = builder.graph.size()
                     builder.add_keyframe(keyframe.stamp_ns)
                     builder.graph.resize(count)  # the link is for tests/fusion/test_graph_link.py
-        walk.covariances = covariances
+        walk.fitted = fitted
         one, other = builders
         assert list(one.values.keys()) == list(other.values.keys())
         keys = sorted(one.graph.keyVector())
