@@ -69,13 +69,14 @@ class FittedNoise:
     def options(self) -> tuple[DetectionNoise, DetectionBias]:
         """Return the options that a filter needs to know of it; the noise floor near an object stays the default."""
         rotation, across, along = (self.parts[name] for name in PARTS)
-        mean_time = float(np.mean([part.correlation_s for part in self.parts.values()]))
         noise = DetectionNoise(across=across.white, along=along.white, rotation_deg=math.degrees(rotation.white))
         bias = DetectionBias(
             across=across.varying,
             along=along.varying,
             rotation_deg=math.degrees(rotation.varying),
-            correlation_s=mean_time,
+            correlation_across_s=across.correlation_s,
+            correlation_along_s=along.correlation_s,
+            correlation_rotation_s=rotation.correlation_s,
             steady_across=across.steady,
             steady_along=along.steady,
             steady_rotation_deg=math.degrees(rotation.steady),

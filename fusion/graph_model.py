@@ -28,7 +28,7 @@ from fusion.nav_state import (
     Array,
     Ints,
 )
-from fusion.object_biases import BIAS_JUMP, BIAS_MODEL_SIZE, BIAS_TAU, bias_sigma, fades
+from fusion.object_biases import BIAS_JUMP, BIAS_MODEL_SIZE, bias_phi, bias_sigma, fades
 from fusion.odometry import move_by_odometry
 from fusion.so3_kernels import apply, apply_transposed, copy, multiply
 
@@ -128,8 +128,8 @@ def rate_at(stamps: Ints, values: Array, stamp: int, gyro_bias: Array) -> Array:
 def bias_step(bias_model: Array, kind: int, mean: Array, seconds: float, left: Array, sigma: Array) -> None:
     """Write by what factor and 1-sigma, each (6,), a bias with this mean changes in some seconds."""
     model = kind * BIAS_MODEL_SIZE
-    phi = np.exp(-seconds / bias_model[model + BIAS_TAU])
     for i in range(6):
+        phi = bias_phi(bias_model, kind, i, seconds)
         stays = phi < 1.0 and not fades(mean, 0, i - i % 3, kind, bias_model)
         left[i] = 1.0 if stays else phi
         sigma[i] = np.sqrt(1.0 - phi * phi) * bias_sigma(bias_model, kind, i)

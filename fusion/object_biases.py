@@ -8,8 +8,10 @@ from fusion.compiled import njit
 from fusion.memory import BIAS_TIME, NOW, Memory
 from fusion.nav_state import AT_BIASES, BIASES, N_BIAS_KINDS, N_ERROR, N_OBJECTS, Array
 
-# Places in the bias model, per kind: sigma of rotation (rad), across and along the ray (share of distance), time (s).
-BIAS_ROTATION, BIAS_ACROSS, BIAS_ALONG, BIAS_TAU, BIAS_JUMP, BIAS_JUMP_AT, BIAS_MODEL_SIZE = range(7)
+# Places in the bias model, per kind: sigma of rotation (rad), across and along the ray (share of distance), and behind
+# them the correlation times of these three (s).
+BIAS_ROTATION, BIAS_ACROSS, BIAS_ALONG, BIAS_TAU = range(4)
+BIAS_JUMP, BIAS_JUMP_AT, BIAS_MODEL_SIZE = range(6, 9)
 
 
 @njit(cache=True)
@@ -23,21 +25,18 @@ def decay_biases(m: Memory) -> None:
     seconds = (m.counters[NOW] - m.counters[BIAS_TIME]) * 1e-9
     m.counters[BIAS_TIME] = m.counters[NOW]
     for kind in range(m.layout[N_BIAS_KINDS]):
-        phi = math.exp(-seconds / m.bias_model[kind * BIAS_MODEL_SIZE + BIAS_TAU])
-        if phi == 1.0:
-            continue
-        for k in range(m.layout[N_OBJECTS]):
+        for k in range(m.layout[N_OBJECTS] if bias_phi(m.bias_model, kind, 0, seconds) < 1.0 else 0):
             for first in (0, 3):
-                _decay(m, k, kind, first, phi)
+                _decay(m, k, kind, first, seconds)
 
 
 @njit(cache=True)
-def _decay(m: Memory, k: int, kind: int, first: int, phi: float) -> None:
+def _decay(m: Memory, k: int, kind: int, first: int, seconds: float) -> None:
     x, P, n, shift = m.x, m.P, m.layout[N_ERROR], 6 * (k + kind * m.layout[N_OBJECTS])
     b, at = m.layout[BIASES] + shift, m.layout[AT_BIASES] + shift
     fading = fades(x, b, first, kind, m.bias_model)
     for i in range(first, first + 3):
-        sigma = bias_sigma(m.bias_model, kind, i)
+        sigma, phi = bias_sigma(m.bias_model, kind, i), bias_phi(m.bias_model, kind, i, seconds)
         if fading:
             x[b + i] *= phi
             for j in range(n):
@@ -78,7 +77,17 @@ def forget_bias(m: Memory, k: int, kind: int, first: int, jumped: bool) -> None:
 @njit(cache=True)
 def bias_sigma(bias_model: Array, kind: int, component: int) -> float:
     """Return the stationary 1-sigma of one bias component: rotation (rad) 0-2, across x, across y, along 3-5."""
-    model = kind * BIAS_MODEL_SIZE
+    return bias_model[kind * BIAS_MODEL_SIZE + _part(component)]
+
+
+@njit(cache=True)
+def bias_phi(bias_model: Array, kind: int, component: int, seconds: float) -> float:
+    """Return what is left of such a component after some seconds, 1 where it never changes."""
+    return math.exp(-seconds / bias_model[kind * BIAS_MODEL_SIZE + BIAS_TAU + _part(component)])
+
+
+@njit(cache=True)
+def _part(component: int) -> int:
     if component < 3:
-        return bias_model[model + BIAS_ROTATION]
-    return bias_model[model + (BIAS_ALONG if component == 5 else BIAS_ACROSS)]
+        return BIAS_ROTATION
+    return BIAS_ALONG if component == 5 else BIAS_ACROSS

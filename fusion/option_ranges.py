@@ -23,7 +23,9 @@ RANGES: dict[str, tuple[str, ...]] = {
         "graph.kernel_width",
     ),
     "(0, inf]": (
-        "bias.correlation_s",
+        "bias.correlation_across_s",
+        "bias.correlation_along_s",
+        "bias.correlation_rotation_s",
         "bias.gross",
         "meeting.lead",
         "start.lead",

@@ -58,13 +58,17 @@ class DetectionBias:
     """1-sigma along the ray, as a share of the distance."""
     rotation_deg: float = 2.5
     """1-sigma of rotation per axis, deg."""
-    correlation_s: float = 4.0
-    """Correlation time, s."""
+    correlation_across_s: float = 4.0
+    """Correlation time of its part across the ray, s."""
+    correlation_along_s: float = 4.0
+    """Of its part along the ray, s."""
+    correlation_rotation_s: float = 12.0
+    """Of its rotation, s: networks turn an object wrong for as long as it is seen from about the same side."""
     steady_across: float = 0.010
     """1-sigma of a second bias that never changes, across the ray, as a share of the distance; 0: no such bias."""
     steady_along: float = 0.020
     """The same along the ray."""
-    steady_rotation_deg: float = 3.5
+    steady_rotation_deg: float = 3.0
     """The same in rotation per axis, deg."""
     jump_after: int = 20
     """An object refused so often in a row has another bias: the old one is forgotten."""

@@ -278,7 +278,9 @@ def _bias_model(bias: DetectionBias) -> list[float]:
         object_biases.BIAS_ROTATION: max(math.radians(bias.rotation_deg), LEAST_BIAS),
         object_biases.BIAS_ACROSS: max(bias.across, LEAST_BIAS),
         object_biases.BIAS_ALONG: max(bias.along, LEAST_BIAS),
-        object_biases.BIAS_TAU: bias.correlation_s,
+        object_biases.BIAS_TAU + object_biases.BIAS_ROTATION: bias.correlation_rotation_s,
+        object_biases.BIAS_TAU + object_biases.BIAS_ACROSS: bias.correlation_across_s,
+        object_biases.BIAS_TAU + object_biases.BIAS_ALONG: bias.correlation_along_s,
         object_biases.BIAS_JUMP: bias.jump,
         object_biases.BIAS_JUMP_AT: bias.gross,
     }
@@ -286,8 +288,8 @@ def _bias_model(bias: DetectionBias) -> list[float]:
         object_biases.BIAS_ROTATION: max(math.radians(bias.steady_rotation_deg), LEAST_BIAS),
         object_biases.BIAS_ACROSS: max(bias.steady_across, LEAST_BIAS),
         object_biases.BIAS_ALONG: max(bias.steady_along, LEAST_BIAS),
-        object_biases.BIAS_TAU: math.inf,
     }
+    steady |= {object_biases.BIAS_TAU + i: math.inf for i in range(3)}
     return [model.get(i, 0.0) for model in (varying, steady) for i in range(object_biases.BIAS_MODEL_SIZE)]
 
 

@@ -7,8 +7,6 @@ asked of the compiled filter's own functions.
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 from filterpy.kalman import predict, update
 from scipy.spatial.transform import Rotation
@@ -34,7 +32,7 @@ from fusion.nav_state import (
     put_pose,
     retract_state,
 )
-from fusion.object_biases import BIAS_JUMP, BIAS_JUMP_AT, BIAS_MODEL_SIZE, BIAS_TAU, bias_sigma
+from fusion.object_biases import BIAS_JUMP, BIAS_JUMP_AT, BIAS_MODEL_SIZE, bias_phi, bias_sigma
 from fusion.options import FuseOptions
 from fusion.place_watch import ON_MAP, RELEASED, TURNED, status_of
 from fusion.prepare import Problem
@@ -137,15 +135,15 @@ class ReferenceFilter:
         Phi, Q = np.eye(layout.n_error), np.zeros((layout.n_error, layout.n_error))
         for kind in range(layout.bias_kinds):
             model = m.bias_model[kind * BIAS_MODEL_SIZE : (kind + 1) * BIAS_MODEL_SIZE]
-            phi = math.exp(-seconds / model[BIAS_TAU])
             for k in range(layout.n_objects):
                 for part in (ROTATION_ROWS, POSITION_ROWS):
                     sigma = np.array([bias_sigma(m.bias_model, kind, i) for i in range(6)])[part]
                     rows = _within(layout.error_slice("biases", k, kind), part)
+                    phi = np.array([bias_phi(m.bias_model, kind, i, seconds) for i in range(6)])[part]
                     bias = m.x[_within(layout.nominal_bias(k, kind), part)]
-                    if np.max(np.abs(bias) / sigma) <= model[BIAS_JUMP_AT] or phi == 1.0:
+                    if np.max(np.abs(bias) / sigma) <= model[BIAS_JUMP_AT] or np.all(phi == 1.0):
                         bias *= phi
-                        Phi[rows, rows] = phi * np.eye(3)
+                        Phi[rows, rows] = np.diag(phi)
                     else:
                         sigma = sigma * model[BIAS_JUMP]
                     Q[rows, rows] = np.diag((1.0 - phi**2) * sigma**2)

@@ -16,8 +16,6 @@ length and its kind; numbers of any type are stored as floats.
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 
 from fusion.compiled import njit
@@ -37,7 +35,7 @@ from fusion.nav_state import (
     Array,
     Ints,
 )
-from fusion.object_biases import BIAS_MODEL_SIZE, BIAS_TAU, fades
+from fusion.object_biases import bias_phi, fades
 from fusion.so3_kernels import multiply_transposed_left
 
 STEP, ODOMETRY, DECAY, CORRECTION, MEETING, FORGETTING, RESTART, ROW, CLONING = range(9)
@@ -98,13 +96,12 @@ def note_decay(m: Memory) -> None:
     seconds = (m.counters[NOW] - m.counters[BIAS_TIME]) * 1e-9
     at, K = m.counters[TAPE_END], m.layout[N_OBJECTS]
     for kind in range(m.layout[N_BIAS_KINDS]):
-        phi = math.exp(-seconds / m.bias_model[kind * BIAS_MODEL_SIZE + BIAS_TAU])
         for k in range(K):
             shift = 6 * (k + kind * K)
             for first in (0, 3):
                 fading = fades(m.x, m.layout[BIASES] + shift, first, kind, m.bias_model)
                 for i in range(first, first + 3):
-                    m.tape[at + shift + i] = phi if fading else 1.0
+                    m.tape[at + shift + i] = bias_phi(m.bias_model, kind, i, seconds) if fading else 1.0
     _close(m, at + 6 * K * m.layout[N_BIAS_KINDS], DECAY)
 
 

@@ -46,7 +46,8 @@ def test_every_option_of_the_stages_is_in_the_reference_with_its_default(referen
     for kind in (FuseOptions, LocalizeOptions):
         for name in option_names(kind):
             assert f"| `{name}` |" in page
-    assert f"| `bias.correlation_s` | `{FuseOptions().bias.correlation_s}` | Correlation time, s. |" in page
+    default = FuseOptions().bias.correlation_across_s
+    assert f"| `bias.correlation_across_s` | `{default}` | Correlation time of its part across the ray, s. |" in page
 
 
 def test_nearly_every_option_is_explained(reference):

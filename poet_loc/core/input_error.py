@@ -44,7 +44,7 @@ def processes(name: str, count: int) -> None:
 def within(interval: str, options: object, *names: str) -> None:
     """Raise InputError for a field of an options record outside an interval such as "(0, 1]" or "[0, inf)".
 
-    A field of a record in the record is named with a dot: bias.correlation_s.
+    A field of a record in the record is named with a dot: bias.correlation_rotation_s.
     """
     low, high = (float(end) for end in interval[1:-1].split(","))
     open_low, open_high = interval[0] == "(", interval[-1] == ")"

@@ -19,9 +19,9 @@ def test_fit_noise_replaces_its_file_only_when_asked(clean_log, tmp_path, capsys
 
 def test_an_impossible_number_in_the_file_is_told_with_the_file(clean_log, tmp_path, capsys):
     path = tmp_path / "noise.yaml"
-    path.write_text("bias:\n  correlation_s: 0\n")
+    path.write_text("bias:\n  correlation_along_s: 0\n")
     assert main(["fuse", str(clean_log), "--out", str(tmp_path / "run"), "--noise-from", str(path)]) == 1
-    assert f"{path}: bias.correlation-s is 0" in one_line(capsys)
+    assert f"{path}: bias.correlation-along-s is 0" in one_line(capsys)
 
 
 def test_fuse_without_varying_biases(clean_log, tmp_path):

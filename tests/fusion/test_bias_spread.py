@@ -128,6 +128,7 @@ def test_compiled_is_plain_with_stated_covariances():
 def test_measurements_carry_the_white_part():
     log = differing(0, True)
     measured = object_measurements(log.object_poses[""], log.landmark_map, log.calibration, FuseOptions())
-    share = 3.0**2 / (3.0**2 + 2.5**2 + 3.5**2) * NOISE.stated_scale**2
+    white, biased = NOISE.rotation_deg**2, BIAS.rotation_deg**2 + BIAS.steady_rotation_deg**2
+    share = white / (white + biased) * NOISE.stated_scale**2
     sizes = np.radians([1.0, 2.0, 4.0, 8.0, 16.0])[measured.objects]
     np.testing.assert_allclose(measured.covariances[:, 0, 0], share * sizes**2)

@@ -18,7 +18,7 @@ from poet_loc.io.log_folder import Log
 
 WHITE = np.array([0.03, 0.03, 0.03, 0.004, 0.004, 0.015])
 VARYING = np.array([0.05, 0.05, 0.05, 0.006, 0.006, 0.03])
-TAU = 2.0
+TAU = np.array([4.0, 4.0, 4.0, 2.0, 2.0, 1.0])
 
 
 def made_log(seed: int, frames: int = 3000) -> Log:
@@ -47,7 +47,14 @@ def test_the_parts_of_errors_of_known_make_are_found():
         assert found.white == pytest.approx(WHITE[part], rel=0.1)
         assert np.hypot(found.varying, found.steady) == pytest.approx(VARYING[part], rel=0.15)
         assert found.varying > 2 * found.steady
-    assert fitted.parts["rotation"].correlation_s == pytest.approx(TAU, rel=0.4)
+        assert found.correlation_s == pytest.approx(TAU[part], rel=0.4)
+
+
+def test_the_options_hold_each_parts_own_correlation_time():
+    fitted = fit_noise([made_log(0)])
+    bias = fitted.options()[1]
+    times = bias.correlation_rotation_s, bias.correlation_across_s, bias.correlation_along_s
+    assert times == tuple(fitted.parts[name].correlation_s for name in ("rotation", "across", "along"))
 
 
 def test_gross_errors_are_counted_and_left_out():

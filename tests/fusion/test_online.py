@@ -14,7 +14,7 @@ from fusion import filter_loop, memory
 from fusion.bias_spread import white_part
 from fusion.measurements import CAMERA_POSE, ODOMETRY_STEP, Measurements
 from fusion.online import Estimator, OnlineOptions
-from fusion.options import FuseOptions, Odometry
+from fusion.options import DetectionBias, FuseOptions, Odometry
 from fusion.prepare import Problem, pose_problem
 from fusion.simulate import SimulationOptions, simulate
 from poet_loc.core.input_error import InputError
@@ -234,7 +234,8 @@ def test_broken_numbers_and_unknown_objects_change_nothing():
 
 
 def test_health_tells_of_accepted_poses_and_of_silence():
-    problem, options = simulated(noise="white"), FuseOptions()
+    options = FuseOptions(bias=DetectionBias(use=False))
+    problem = simulated(noise="white", options=options)
     estimator = estimator_for(problem, options)
     assert estimator.health().mode == "initialising"
     assert estimator.state() is None

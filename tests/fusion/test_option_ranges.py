@@ -39,7 +39,8 @@ def test_no_option_is_nan_or_negative(name, value):
     [
         ("gate.probability", 0.0),
         ("gate.probability", 1.5),
-        ("bias.correlation_s", 0.0),
+        ("bias.correlation_across_s", 0.0),
+        ("bias.correlation_rotation_s", 0.0),
         ("noise.rotation_deg", math.inf),
         ("graph.keyframe_rate_hz", 0.0),
         ("graph.kernel_width", 0.0),

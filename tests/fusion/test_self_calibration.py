@@ -124,9 +124,12 @@ def with_model_biases(log: Log, seed: int) -> Log:
         seconds = np.diff(poses.stamps_ns[mine], prepend=poses.stamps_ns[mine[0]]) * 1e-9
         steady = sigma(bias.steady_rotation_deg, bias.steady_across, bias.steady_along) * rng.normal(size=6)
         size = sigma(bias.rotation_deg, bias.across, bias.along)
+        times = np.r_[
+            np.full(3, bias.correlation_rotation_s), np.full(2, bias.correlation_across_s), bias.correlation_along_s
+        ]
         varying = size * rng.normal(size=6)
         for row, dt in zip(mine, seconds):
-            phi = np.exp(-dt / bias.correlation_s)
+            phi = np.exp(-dt / times)
             varying = phi * varying + np.sqrt(1 - phi**2) * size * rng.normal(size=6)
             error[row] = steady + varying
     x, y, stretch = error[:, 3], error[:, 4], error[:, 5:]
