@@ -32,6 +32,9 @@ _TELLING = 0.45  # correlation from which a source is believed
 _MARGIN = 0.25  # by which another hypothesis must fit better ..
 _CLEAN, _CLEAN_MARGIN = 0.97, 0.05  # .. and where it fits as well as this
 _DEGREES = 180.0 / np.pi
+_UNIT_MARGIN = 3.0  # on real detections the scale is off by less than 2
+_FAINT, _ABOVE_CHANCE = 0.2, 0.1  # correlation from which a source tells that much
+_LEAST_IMU = 50  # samples
 _OFFSET_FLOOR_S, _OFFSET_NOISE_S = 0.005, 0.07
 _OFFSET_CLEAR, _OFFSET_ADVANTAGE = 0.8, 1.5  # below this correlation, by so many standard errors above the expected
 
@@ -51,9 +54,51 @@ class _Compared:
         return max(fit - 0.05 * (reading != "as is") for (reading, way), fit in self.fits.items() if way == direction)
 
 
+@dataclass(frozen=True)
+class Turning:
+    """How fast the gyroscope turns beside the poses of a file that turn with it."""
+
+    over_poses: float
+    """1 where it is in rad/s."""
+    correlation: float
+    file: str
+
+    @property
+    def in_degrees(self) -> bool:
+        """Whether no other unit explains it: 57 is far from 1, and from what noise in the poses does to it."""
+        return _DEGREES / _UNIT_MARGIN < self.over_poses < _DEGREES * _UNIT_MARGIN
+
+    def as_degrees(self) -> Finding:
+        """Return the finding that the gyroscope is in degrees per second."""
+        what = "the gyroscope turns 57 times as fast as the poses: degrees"
+        fix = "multiply by pi/180: rad/s belong here"
+        evidence: Evidence = {"gyroscope_over_poses": self.over_poses, "against": self.file}
+        evidence |= {"correlation": self.correlation}
+        return Finding("gyroscope-degrees", "error", "imu.csv", what, fix, evidence, _gyroscope_in_radians)
+
+
+def gyroscope_beside_poses(log: Log) -> Turning | None:
+    """Return what the file says whose poses turn most like the gyroscope; None where none turns enough like it.
+
+    Turns that the gyroscope comes nowhere near are gross errors of the poses; which those are depends on its unit, so
+    it is read both ways.
+    """
+    if log.imu is None or len(log.imu) < _LEAST_IMU:
+        return None
+    found = []
+    for source in pose_sources(log):
+        rates = turn_rates(source)
+        for factor in (1.0, _DEGREES):
+            imu = replace(log.imu, angular_velocity=log.imu.angular_velocity / factor)
+            match = match_turns(imu, rates)
+            if match is not None and match.correlation > max(_FAINT, match.background + _ABOVE_CHANCE):
+                found.append(Turning(match.gyroscope_scale * factor, match.correlation, source.file))
+    return max(found, key=lambda each: each.correlation, default=None)
+
+
 def check_turns(log: Log) -> Iterator[Finding]:
     """Yield what the turn rates say; nothing where IMU or poses are missing or do not tell."""
-    if log.imu is None or len(log.imu) < 50:
+    if log.imu is None or len(log.imu) < _LEAST_IMU:
         return
     R_cam_imu = None
     if log.calibration is not None and log.calibration.T_cam_imu is not None:
@@ -129,12 +174,9 @@ def _gyroscope_unit(compared: _Compared) -> Iterator[Finding]:
     scale = compared.match.gyroscope_scale
     evidence: Evidence = {"gyroscope_over_poses": scale, "against": compared.source.file}
     evidence |= {"correlation": compared.match.correlation}
-    if 0.5 * _DEGREES < scale < 2.0 * _DEGREES:
-        what, fix = (
-            "the gyroscope turns 57 times as fast as the poses: degrees",
-            "multiply by pi/180: rad/s belong here",
-        )
-        yield Finding("gyroscope-degrees", "error", "imu.csv", what, fix, evidence, _gyroscope_in_radians)
+    turning = Turning(scale, compared.match.correlation, compared.source.file)
+    if turning.in_degrees:
+        yield turning.as_degrees()
     elif not 0.6 < scale < 1.7 and compared.match.correlation > 0.8:
         what = "the gyroscope does not turn as fast as the poses"
         fix = "look at its unit and range setting, and at the unit of the stamps"

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from poet_loc.check.finding import Evidence, Finding
 from poet_loc.check.streams import trajectories_of
+from poet_loc.check.turns import gyroscope_beside_poses
 from poet_loc.core.geometry import make_pose
 from poet_loc.core.records import LandmarkMap, ObjectPoses
 from poet_loc.core.trajectory import Trajectory
@@ -23,7 +24,7 @@ _WINDOW_S = 0.5
 _QUIET = 0.05  # scatter of a quiet window's acceleration, as a share of its mean
 _NORM_TOLERANCE = 0.6
 _LARGEST_BIAS = 0.2
-_FASTEST_TURN = 10.0
+_FASTEST_TURN, _SLOWEST_TURN = 10.0, 1.0  # below the latter degrees would be a camera that hardly turns
 _FASTEST_MOTION = 50.0
 _SCALE_SCATTER = 0.5
 _UNITS = {"g": GRAVITY, "milli-g": GRAVITY / 1e3, "cm/s^2": 0.01, "mm/s^2": 0.001, "ft/s^2": 0.3048}
@@ -63,9 +64,18 @@ def check_accelerometer(log: Log) -> Iterator[Finding]:
 
 
 def check_gyroscope(log: Log) -> Iterator[Finding]:
-    """Yield a gyroscope whose reading at rest, or whose fastest turn, only makes sense in degrees."""
+    """Yield a gyroscope in degrees or with a large bias.
+
+    Degrees are an error where poses turn with it, 57 times slower, and a warning where only its reading at rest or its
+    fastest turn hints at them; no hint counts where poses turn as fast as it does.
+    """
     windows = _windows(log)
     if log.imu is None or windows is None:
+        return
+    fast = float(np.percentile(np.linalg.norm(log.imu.angular_velocity, axis=1), 95))
+    turning = gyroscope_beside_poses(log) if fast > _SLOWEST_TURN else None
+    if turning is not None and turning.in_degrees:
+        yield turning.as_degrees()
         return
     rates, means, scatter, wobble = windows
     quiet = np.flatnonzero(scatter / np.maximum(np.linalg.norm(means, axis=1), 1e-9) < _QUIET)
@@ -74,16 +84,16 @@ def check_gyroscope(log: Log) -> Iterator[Finding]:
     still = quiet[np.argsort(wobble[quiet])[: max(1, len(quiet) // 10)]]
     bias = np.median(rates[still], axis=0)
     at_rest = float(np.linalg.norm(bias))
-    fast = float(np.percentile(np.linalg.norm(log.imu.angular_velocity, axis=1), 95))
-    if at_rest < _LARGEST_BIAS and fast < _FASTEST_TURN:
+    if at_rest < _LARGEST_BIAS and (fast < _FASTEST_TURN or turning is not None):
         return
     evidence: Evidence = {"norm_at_rest_rad_s": at_rest, "as_degrees_deg_s": at_rest, "p95_rad_s": fast}
     evidence |= {f"{name}_at_rest_rad_s": float(value) for name, value in zip("xyz", bias, strict=True)}
     what = f"the gyroscope reads {at_rest:.2g} rad/s in its quietest moments"
-    if fast > _FASTEST_TURN or fast > 5.0 * at_rest or at_rest > 1.0 or wobble[still].min() > 0.02:
+    hinted = fast > _FASTEST_TURN or fast > 5.0 * at_rest or at_rest > 1.0 or wobble[still].min() > 0.02
+    if hinted and turning is None:
         fix = "multiply by pi/180: rad/s belong here"
         repair = _scaled_imu(np.pi / 180.0, 1.0)
-        yield Finding("gyroscope-degrees", "error", "imu.csv", f"{what}: degrees, it seems", fix, evidence, repair)
+        yield Finding("gyroscope-degrees", "warning", "imu.csv", f"{what}: degrees, it seems", fix, evidence, repair)
     else:
         fix = "calibrate the gyroscope at rest, or see whether it is in degrees"
         yield Finding("gyroscope-bias", "error", "imu.csv", f"{what}: a large bias", fix, evidence)

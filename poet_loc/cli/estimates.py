@@ -32,6 +32,8 @@ Fusion = Literal[
 ]
 """<estimator>/<measurements>, as in the name of the estimate."""
 
+_REFUSED = ("accelerometer-unit", "no-gravity", "gyroscope-degrees")  # where certain
+
 FUSIONS: tuple[Fusion, ...] = ("eskf/objects", "eskf/camera", "graph/objects")
 
 
@@ -105,9 +107,6 @@ def estimate_log(
         report.note(f"{log.path}: no imu.csv: fused on {fused[0].motion.replace('-', ' ')} instead")
     for result in fused:
         _tell_of_moved_objects(log, result, report)
-    if any(result.motion in ("imu", "imu+odometry") for result in fused):
-        for finding in check_gyroscope(log):
-            report.note(f"{log.path / finding.file}: {finding.what}; {finding.fix}")
     evaluation = evaluate_estimates(log, name, _estimates(log, localized, fused), options.evaluation, report)
     return Estimates(log, name, localized, fused, evaluation)
 
@@ -186,28 +185,41 @@ def _fused(
 ) -> Iterator[FuseResult]:
     from fusion.fuse import fuse
 
-    wanted = any(with_fusion(options.fusion, fusion).measurements == "camera" for fusion in fusions)
+    choices = [with_fusion(options.fusion, fusion) for fusion in fusions]
+    wanted = any(choice.measurements == "camera" for choice in choices)
     from_solver = _solved(log, detections, localized, options.solver, attempt) if wanted else None
     object_poses = None if detections is None else log.object_poses[detections]
+    refused = _refused_units(log, detections, attempt.report) if any(map(_takes_imu, choices)) else None
     there = {"objects": object_poses is not None, "camera": log.camera_poses is not None or from_solver is not None}
-    for fusion in fusions:
-        choice = with_fusion(options.fusion, fusion)
+    for fusion, choice in zip(fusions, choices, strict=True):
         if not there[choice.measurements] and not attempt.strict:
             continue
         attempt.report.step(f"fuse {fusion}")
         try:
-            if choice.motion in ("auto", "imu", "imu+odometry"):
-                refuse_other_units(log)
+            if refused is not None and _takes_imu(choice):
+                raise refused
             yield fuse(log, choice, camera_poses=from_solver, object_poses=object_poses)
         except InputError as error:
             attempt.failed(error, f"fuse/{fusion}")
 
 
-def refuse_other_units(log: Log) -> None:
-    """Raise InputError where the IMU's specific force at rest is g in another unit, or none at all."""
-    for finding in check_accelerometer(log):
-        if finding.check in ("accelerometer-unit", "no-gravity"):
-            raise InputError(finding.what, path=log.path / finding.file, fix=finding.fix)
+def _takes_imu(options: FuseOptions) -> bool:
+    return options.motion in ("auto", "imu", "imu+odometry")
+
+
+def _refused_units(log: Log, detections: str | None, report: Report) -> InputError | None:
+    """Return what is wrong where the IMU is in other units for sure; note where it only seems so.
+
+    The ground truth, which no estimate may look at, has no say.
+    """
+    poses = {} if detections is None else {detections: log.object_poses[detections]}
+    log = replace(log, object_poses=poses, T_world_cam=None, T_world_imu=None)
+    for finding in (*check_accelerometer(log), *check_gyroscope(log)):
+        if finding.severity == "error" and finding.check in _REFUSED:
+            return InputError(finding.what, path=log.path / finding.file, fix=finding.fix)
+        if finding.check.startswith("gyroscope"):
+            report.note(f"{log.path / finding.file}: {finding.what}; {finding.fix}")
+    return None
 
 
 def _solved(

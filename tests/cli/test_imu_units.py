@@ -29,8 +29,20 @@ def test_a_specific_force_in_another_unit_is_refused(log, tmp_path, capsys, fact
     assert not (tmp_path / "run").exists()
 
 
-def test_turn_rates_in_degrees_are_told(log, tmp_path, capsys):
+def test_turn_rates_in_degrees_are_refused(log, tmp_path, capsys):
     spoil(log, float(np.degrees(1.0)), 1.0)
+    assert main(["fuse", str(log), "--out", str(tmp_path / "run")]) == 1
+    line = one_line(capsys)
+    assert f"{log / 'imu.csv'}: the gyroscope turns 57 times as fast as the poses: degrees" in line
+    assert "multiply by pi/180" in line
+    assert not (tmp_path / "run").exists()
+
+
+def test_turn_rates_in_degrees_are_told_where_no_poses_tell_them(log, tmp_path, capsys):
+    """A camera that hardly turns beside a gyroscope with a bias of a few degrees per second."""
+    imu = read_imu(log / "imu.csv")
+    still = np.random.default_rng(0).normal(0.0, 0.05, (len(imu), 3)) + [1.2, -0.8, 0.4]
+    write_imu(log / "imu.csv", ImuSamples(imu.stamps_ns, still, imu.specific_force))
     main(["fuse", str(log), "--out", str(tmp_path / "run"), "--no-pictures"])
     assert "degrees, it seems; multiply by pi/180" in capsys.readouterr().err
 
