@@ -16,6 +16,7 @@ from fusion.eskf import ACCEPTED, POSITION_ONLY, ROTATION_ONLY, cholesky
 from fusion.graph_model import (
     BIAS_COLUMNS,
     EXTRINSIC_COLUMNS,
+    MOTION_SIZE,
     OBJECT_COLUMNS,
     OFFSET_COLUMN,
     VELOCITY_COLUMNS,
@@ -64,7 +65,7 @@ def linearise(
     biases, x = now[GYRO_BIAS : ACCEL_BIAS + 3] if not odometry else np.zeros(6), np.empty(len(start))
     columns = columns_of(layout, not odometry and (layout[AT_TIME_OFFSET] >= 0 or log.stamps[first] != keyframe_ns))
     rows, owners, count = np.empty((6 * (end - first), len(columns) + 1)), np.empty(6 * (end - first), np.int64), 0
-    here = np.copy(start)
+    here, stamp, motion, rate = np.copy(start), np.int64(-1), np.zeros(MOTION_SIZE), np.zeros(3)
     for i in range(3 if odometry else 0):  # it knows no velocity
         here[VELOCITY + i] = 0.0
     copy(now[layout[BIASES] :], here[layout[BIASES] :])
@@ -73,24 +74,19 @@ def linearise(
         if passed == 0 or kind == ODOMETRY_STEP:
             continue
         above, below = 0 if passed & ROTATION_ONLY else 3, 6 if passed & POSITION_ONLY else 3
-        motion = motion_between(log.imu_stamps, log.imu_values, keyframe_ns, log.stamps[i], biases, odometry)
-        rate = rate_at(log.imu_stamps, log.imu_values, log.stamps[i], biases[0:3])
+        if log.stamps[i] != stamp:
+            stamp = log.stamps[i]
+            motion = motion_between(log.imu_stamps, log.imu_values, keyframe_ns, stamp, biases, odometry)
+            rate = rate_at(log.imu_stamps, log.imu_values, stamp, biases[0:3])
         copy(here, x)
         seen = kind, k, above, below - above, fitted.rotations[i], log.translations[i]
         e, J = error_and_jacobian(*seen, rate, motion, x, layout)
         if kind == OBJECT_POSE:
             _bring_to(start, now, k, J, e, layout)
-        own = rows[count : count + len(e)]
-        for r in range(len(e)):
-            owners[count + r] = k if kind == OBJECT_POSE else -1
-            own[r, -1] = -e[r]
-            for c in range(len(columns)):
-                own[r, c] = J[r, columns[c]]
-        whiten_rows(fitted.covariances[i], above, own)
-        for r in range(len(e)):
-            for c in range(own.shape[1]):
-                own[r, c] *= np.sqrt(fitted.weights[i])
-        count += len(e)
+        _write_white(J, e, columns, fitted.covariances[i], above, fitted.weights[i], rows[count : count + len(e)])
+        for _ in range(len(e)):
+            owners[count] = k if kind == OBJECT_POSE else -1
+            count += 1
     return _compress(rows[:count], owners[:count], layout[N_OBJECTS], private_size(layout))
 
 
@@ -130,6 +126,19 @@ def _bring_to(start: Array, now: Array, k: int, J: Array, e: Array, layout: Ints
         for r in range(len(e)):
             for c in range(6):
                 e[r] -= J[r, BIAS_COLUMNS + 6 * kind + c] * (now[at + c] - start[at + c])
+
+
+@njit(cache=True)
+def _write_white(J: Array, e: Array, columns: Ints, covariance: Array, first: int, weight: float, rows: Array) -> None:
+    """Write error and Jacobian of a measurement as rows of unit noise that count as much as their weight."""
+    for r in range(len(e)):
+        rows[r, -1] = -e[r]
+        for c in range(len(columns)):
+            rows[r, c] = J[r, columns[c]]
+    whiten_rows(covariance, first, rows)
+    for r in range(len(e)):
+        for c in range(rows.shape[1]):
+            rows[r, c] *= np.sqrt(weight)
 
 
 @njit(cache=True)
