@@ -12,7 +12,8 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from poet_loc.data.world import labels
 from poet_loc.data.world.objects import WorldObject, clutter, household_objects
-from poet_loc.data.world.rasterizer import NEAR, cover, shade
+from poet_loc.data.world.rasterizer import NEAR, cover
+from poet_loc.data.world.shading import Light, Table, Textures, Things, shade
 
 Array = NDArray[np.float64]
 
@@ -20,6 +21,7 @@ SURFACES = 96
 """Table tops and backgrounds that the world knows."""
 _LEVELS = 6
 _SHADOW_SIZE = 384
+_TABLE_SHINE = 0.05
 
 
 @dataclass(frozen=True)
@@ -143,20 +145,18 @@ def render_image(
     width, height = size
     u, v = ((coordinate + 0.5) * samples - 0.5 for coordinate in (geometry.u, geometry.v))
     triangle, _ = cover(u, v, geometry.inverse_depth, geometry.faces, width * samples, height * samples)
-    shadow, light_axes, light_frame = _shadow_map(geometry, scene, T_cam_world)
     texture_of = np.array(scene.things, np.int32)
     shine = np.array([assets.thing(number).shine for number in scene.things], np.float32)
     gain = np.concatenate([scene.gains, shine[:, None]], 1).astype(np.float32)[geometry.face_thing]
-    image = np.zeros((height, width, 3), np.float32)
-    table = np.array([assets.surface_texture(scene.table_surface), scene.table_half_size, scene.table_repeats, 0.05])
-    shade(
-        triangle, samples, np.asarray(intrinsics, np.float32), geometry.points, geometry.normals, geometry.uv,
-        geometry.faces, texture_of[geometry.face_thing], _mip_levels(geometry, assets, texture_of), gain,
-        assets.texels, assets.texture_table, _LINEAR, _lights_in_camera(scene.lights, T_cam_world.rotation), shadow,
-        light_axes, light_frame, table.astype(np.float32), _table_axes(scene, T_cam_world),
-        _backdrop(assets, scene, size), image,
+    things = Things(
+        geometry.points, geometry.normals, geometry.uv, geometry.faces, texture_of[geometry.face_thing],
+        _mip_levels(geometry, assets, texture_of), gain,
     )  # fmt: skip
-    return image
+    return shade(
+        triangle, samples, np.asarray(intrinsics, np.float32), things, _table(assets, scene, T_cam_world),
+        Textures(assets.texels, assets.texture_table, _LINEAR), _light(geometry, scene, T_cam_world),
+        _backdrop(assets, scene, size),
+    )  # fmt: skip
 
 
 def depth_and_things(geometry: Geometry, size: tuple[int, int]) -> tuple[NDArray[np.float32], NDArray[np.int32]]:
@@ -199,10 +199,8 @@ def _lights_in_camera(lights: Lights, R_cam_world: Rotation) -> NDArray[np.float
     return np.stack([up, lights.sky, lights.ground, sun, lights.sun, fill, lights.fill]).astype(np.float32)
 
 
-def _shadow_map(
-    geometry: Geometry, scene: Scene, T_cam_world: RigidTransform
-) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:
-    """Return the shadow map, the light's axes (right, down, away) in camera axes, its frame (rasterizer._lit)."""
+def _light(geometry: Geometry, scene: Scene, T_cam_world: RigidTransform) -> Light:
+    """Return the lights with the sun's shadow map."""
     away = -T_cam_world.rotation.apply(scene.lights.towards_sun)
     right = np.cross(away, [0.3, 0.2, 1.0] if abs(away[2]) < 0.9 else [1.0, 0.0, 0.1])
     right /= np.linalg.norm(right)
@@ -215,12 +213,15 @@ def _shadow_map(
     _, buffer = cover(light_u, light_v, (-depth).astype(np.float32), geometry.faces, _SHADOW_SIZE, _SHADOW_SIZE)
     bias = 2.5 / scale + 0.002
     frame = np.array([start_x, start_y, scale, bias], np.float32)
-    return buffer, axes.astype(np.float32), frame
+    colours = _lights_in_camera(scene.lights, T_cam_world.rotation)
+    return Light(colours, buffer, axes.astype(np.float32), frame)
 
 
-def _table_axes(scene: Scene, T_cam_world: RigidTransform) -> NDArray[np.float32]:
+def _table(assets: Assets, scene: Scene, T_cam_world: RigidTransform) -> Table:
     axes_world = Rotation.from_euler("z", scene.turn).as_matrix().T
-    return np.concatenate([T_cam_world.translation[None], T_cam_world.rotation.apply(axes_world)]).astype(np.float32)
+    axes = np.concatenate([T_cam_world.translation[None], T_cam_world.rotation.apply(axes_world)]).astype(np.float32)
+    numbers = np.array([scene.table_half_size, scene.table_repeats, _TABLE_SHINE], np.float32)
+    return Table(assets.surface_texture(scene.table_surface), numbers, axes)
 
 
 def _backdrop(assets: Assets, scene: Scene, size: tuple[int, int]) -> NDArray[np.float32]:
