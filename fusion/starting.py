@@ -90,60 +90,68 @@ def cast_vote(
         return
     slot = m.counters[VOTE_HEAD] & (len(m.vote_stamps) - 1)
     vote = m.votes[slot]
-    R_wc, R_wi, lever, p_wc = w.step[0:9], vote[0:9], w.step[9:12], w.step[12:15]
     if kind == OBJECT_POSE:
-        at = OBJECTS + OBJECT_SIZE * k
-        multiply_transposed_right(m.x[at : at + 9], rotation, R_wc)
-        apply(R_wc, translation[0], translation[1], translation[2], lever)
-        for i in range(3):
-            p_wc[i] = m.x[at + 9 + i] - lever[i]
-        distance = math.sqrt(translation[0] ** 2 + translation[1] ** 2 + translation[2] ** 2)
+        _vote_of_object(m, w, k, rotation, translation, covariance, vote)
     else:
-        for i in range(9):
-            R_wc[i] = rotation[i]
-        for i in range(3):
-            p_wc[i] = translation[i]
-        distance = 1.0
-    multiply_transposed_right(R_wc, m.x[EXTRINSIC_ROTATION : EXTRINSIC_ROTATION + 9], R_wi)
-    p_ic = m.x[EXTRINSIC_POSITION : EXTRINSIC_POSITION + 3]
-    apply(R_wi, p_ic[0], p_ic[1], p_ic[2], lever)
-    for i in range(3):
-        vote[9 + i] = p_wc[i] - lever[i]
-        vote[21 + i] = m.x[POSITION + i]
-        vote[VOTE_ARM + i], vote[VOTE_PLACE + i], vote[VOTE_AXIS + i] = 0.0, vote[9 + i], 0.0
-    vote[VOTE_ORDER], vote[VOTE_OBJECT] = 1.0, -1.0
-    if kind == OBJECT_POSE:
-        axis = m.axes[k]
-        vote[VOTE_ORDER], vote[VOTE_OBJECT] = m.orders[k], k
-        apply(m.x[at : at + 9], axis[0], axis[1], axis[2], vote[VOTE_AXIS : VOTE_AXIS + 3])
-        R_ic = m.x[EXTRINSIC_ROTATION : EXTRINSIC_ROTATION + 9]
-        apply(R_ic, translation[0], translation[1], translation[2], lever)
-        for i in range(3):
-            vote[VOTE_ARM + i] = p_ic[i] + lever[i]
-            vote[VOTE_PLACE + i] = m.x[at + 9 + i]
+        _vote_of_camera(m, w, rotation, translation, covariance, vote)
     for i in range(9):
         vote[12 + i] = m.x[i]
+    for i in range(3):
+        vote[21 + i] = m.x[POSITION + i]
     m.used[slot] = decision & POSITION_ONLY  # rotation alone does not hold the position
-    vote[VOTE_DISTANCE] = distance
-    _write_variances(m, kind, k, translation, covariance, distance, vote)
     m.vote_stamps[slot] = m.counters[NOW]
     m.counters[VOTE_HEAD] += 1
 
 
 @njit(cache=True)
-def _write_variances(
-    m: Memory, kind: int, k: int, translation: Array, covariance: Array, distance: float, vote: Array
-) -> None:
-    """Write the variances of a vote's whole error, biases and all."""
-    whole = covariance[3, 3] + covariance[4, 4] + covariance[5, 5]
+def _vote_of_camera(m: Memory, w: Work, R_wc: Array, p_wc: Array, covariance: Array, vote: Array) -> None:
+    """Write what a camera pose says."""
+    _write_imu(m, w, R_wc, p_wc, vote)
+    for i in range(3):
+        vote[VOTE_ARM + i], vote[VOTE_PLACE + i], vote[VOTE_AXIS + i] = 0.0, vote[9 + i], 0.0
+    vote[VOTE_ORDER], vote[VOTE_OBJECT], vote[VOTE_DISTANCE] = 1.0, -1.0, 1.0
     vote[VOTE_TURN] = (covariance[0, 0] + covariance[1, 1] + covariance[2, 2]) / 3.0
-    vote[VOTE_ACROSS] = vote[VOTE_ALONG] = whole / 3.0
-    if kind != OBJECT_POSE:
-        return
-    along = 0.0
+    vote[VOTE_ACROSS] = vote[VOTE_ALONG] = (covariance[3, 3] + covariance[4, 4] + covariance[5, 5]) / 3.0
+
+
+@njit(cache=True)
+def _vote_of_object(m: Memory, w: Work, k: int, R_co: Array, p_co: Array, covariance: Array, vote: Array) -> None:
+    """Write what an object's pose in the camera says, the object standing where the map says."""
+    R_wc, lever, p_wc, at = w.step[0:9], w.step[9:12], w.step[12:15], OBJECTS + OBJECT_SIZE * k
+    multiply_transposed_right(m.x[at : at + 9], R_co, R_wc)
+    apply(R_wc, p_co[0], p_co[1], p_co[2], lever)
+    for i in range(3):
+        p_wc[i] = m.x[at + 9 + i] - lever[i]
+    _write_imu(m, w, R_wc, p_wc, vote)
+    axis, R_ic = m.axes[k], m.x[EXTRINSIC_ROTATION : EXTRINSIC_ROTATION + 9]
+    vote[VOTE_ORDER], vote[VOTE_OBJECT] = m.orders[k], k
+    apply(m.x[at : at + 9], axis[0], axis[1], axis[2], vote[VOTE_AXIS : VOTE_AXIS + 3])
+    apply(R_ic, p_co[0], p_co[1], p_co[2], lever)
+    for i in range(3):
+        vote[VOTE_ARM + i] = m.x[EXTRINSIC_POSITION + i] + lever[i]
+        vote[VOTE_PLACE + i] = m.x[at + 9 + i]
+    vote[VOTE_DISTANCE] = math.sqrt(p_co[0] ** 2 + p_co[1] ** 2 + p_co[2] ** 2)
+    _write_variances(m, k, p_co, covariance, vote)
+
+
+@njit(cache=True)
+def _write_imu(m: Memory, w: Work, R_wc: Array, p_wc: Array, vote: Array) -> None:
+    """Write where the imu is when the camera is at a pose."""
+    R_wi, lever, p_ic = vote[0:9], w.step[15:18], m.x[EXTRINSIC_POSITION : EXTRINSIC_POSITION + 3]
+    multiply_transposed_right(R_wc, m.x[EXTRINSIC_ROTATION : EXTRINSIC_ROTATION + 9], R_wi)
+    apply(R_wi, p_ic[0], p_ic[1], p_ic[2], lever)
+    for i in range(3):
+        vote[9 + i] = p_wc[i] - lever[i]
+
+
+@njit(cache=True)
+def _write_variances(m: Memory, k: int, p_co: Array, covariance: Array, vote: Array) -> None:
+    """Write the variances of an object's whole error, biases and all."""
+    whole, along, distance = covariance[3, 3] + covariance[4, 4] + covariance[5, 5], 0.0, vote[VOTE_DISTANCE]
+    vote[VOTE_TURN] = (covariance[0, 0] + covariance[1, 1] + covariance[2, 2]) / 3.0
     for i in range(3):
         for j in range(3):
-            along += translation[i] * covariance[3 + i, 3 + j] * translation[j] / (distance * distance)
+            along += p_co[i] * covariance[3 + i, 3 + j] * p_co[j] / (distance * distance)
     vote[VOTE_ACROSS], vote[VOTE_ALONG] = 0.5 * (whole - along), along
     spread = m.x[m.layout[SPREADS] + SPREAD_SIZE * k :]
     for bias in range(m.layout[N_BIAS_KINDS]):
