@@ -60,32 +60,20 @@ def check_rotations_against_map(log: Log) -> Iterator[Finding]:
 
     The rotation from one object to another is the same in the detections of a frame and in the map.
     """
-    if log.landmark_map is None or len(log.landmark_map) < 2:
-        return
-    misfits: dict[str, dict[tuple[Reading, Reading], float]] = {}
-    for name, poses in log.object_poses.items():
-        pairs = _pairs(poses, log.landmark_map)
-        if len(pairs[0]) >= _LEAST_SEEN:
-            misfits[name] = {
-                both: _misfit(poses, log.landmark_map, pairs, *both) for both in product(READINGS, READINGS)
-            }
-    if not misfits:
-        return
-    own = {name: table["as is", "as is"] for name, table in misfits.items()}
-    if min(own.values()) < _MISFITS_DEG:
+    misfits = _misfits(log)
+    if not misfits or min(table["as is", "as is"] for table in misfits.values()) < _MISFITS_DEG:
         return
     name = min(misfits, key=lambda each: min(misfits[each].values()))
     table = misfits[name]
     order = sorted(table, key=lambda both: table[both] + 2.0 * sum(reading != "as is" for reading in both))
+    if table[order[0]] >= _FITS_DEG or table[order[1]] <= table[order[0]] + _FITS_DEG:
+        return  # no other reading is clearly right
     of_detections, of_map = order[0]
-    clear = table[order[0]] < _FITS_DEG and table[order[1]] > table[order[0]] + _FITS_DEG
     evidence: Evidence = {
-        "median_misfit_deg": own[name],
+        "median_misfit_deg": table["as is", "as is"],
         f"misfit_deg_detections_{of_detections}_map_{of_map}": table[order[0]],
         "next_best_deg": table[order[1]],
     }
-    if not clear:
-        return
     for reading, file, T in (
         (of_detections, object_poses_file(name), "T_cam_obj"),
         (of_map, "landmarks.json", "T_world_obj"),
@@ -97,6 +85,19 @@ def check_rotations_against_map(log: Log) -> Iterator[Finding]:
         elif reading == "inverse":
             what = "the poses are the other direction, it seems: only inverted detections and map agree"
             yield Finding("poses-inverted", "error", file, what, f"write {T}", evidence, _reread(file, name, reading))
+
+
+def _misfits(log: Log) -> dict[str, dict[tuple[Reading, Reading], float]]:
+    """Return by how much (deg) each set of detections and the map disagree, under each reading of either."""
+    misfits: dict[str, dict[tuple[Reading, Reading], float]] = {}
+    if log.landmark_map is None or len(log.landmark_map) < 2:
+        return misfits
+    for name, poses in log.object_poses.items():
+        pairs = _pairs(poses, log.landmark_map)
+        if len(pairs[0]) >= _LEAST_SEEN:
+            readings = product(READINGS, READINGS)
+            misfits[name] = {both: _misfit(poses, log.landmark_map, pairs, *both) for both in readings}
+    return misfits
 
 
 @dataclass(frozen=True)

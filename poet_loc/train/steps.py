@@ -100,40 +100,77 @@ def train_steps(
 
     report(averaged module, step) is validation, and goes into log.jsonl beside the losses.
     """
-    options.out.mkdir(parents=True, exist_ok=True)
-    parameters = [p for p in module.parameters() if p.requires_grad]
-    optimizer = Optimizer(module, options.optimizer, options.weight_decay)
-    averaged = Averaged(module, options.averaging)
-    step, spent = _resume(options.out / "checkpoint.pt", module, averaged, optimizer)
-    start = time.process_time()
-    mean: dict[str, float] = {}
-    low = low_precision(options.precision)
-    last = options.steps if options.max_steps is None else min(options.steps, step + options.max_steps)
-    for _ in _shown(range(step, last), options):
-        torch.manual_seed((options.seed << 32) + step)  # dropout of a resumed run is that of an uninterrupted one
-        with torch.autocast("cpu", torch.bfloat16, enabled=low):
-            parts = losses(module, step)
+    run = _Run(module, options)
+    last = options.steps if options.max_steps is None else min(options.steps, run.step + options.max_steps)
+    for _ in _shown(range(run.step, last), options):
+        run.learn(losses)
+        if run.step % options.save_every == 0 or run.step == last:
+            due = run.step % report_every == 0 or run.step == options.steps
+            run.save(report(run.averaged.module, run.step) if report and due else {})
+    return run.averaged.module
+
+
+class _Run(Generic[Network]):
+    """A module with its average, its optimiser, and how far it is: what a checkpoint holds."""
+
+    def __init__(self, module: Network, options: StepOptions) -> None:
+        options.out.mkdir(parents=True, exist_ok=True)
+        self.module, self.options = module, options
+        self.parameters = [p for p in module.parameters() if p.requires_grad]
+        self.optimizer = Optimizer(module, options.optimizer, options.weight_decay)
+        self.averaged = Averaged(module, options.averaging)
+        self.low = low_precision(options.precision)
+        self.step, self.minutes = 0, 0.0
+        self.checkpoint = options.out / "checkpoint.pt"
+        if self.checkpoint.exists():
+            self._resume()
+        self.began = time.process_time() - 60.0 * self.minutes
+        self.mean: dict[str, float] = {}
+
+    def learn(self, losses: Callable[[Network, int], Losses]) -> None:
+        """Do one step; its losses enter their running means."""
+        torch.manual_seed((self.options.seed << 32) + self.step)  # dropout of a resumed run is the uninterrupted one's
+        with torch.autocast("cpu", torch.bfloat16, enabled=self.low):
+            parts = losses(self.module, self.step)
         total = torch.stack(list(parts.values())).sum()
-        module.zero_grad(set_to_none=True)
+        self.module.zero_grad(set_to_none=True)
         total.backward()
-        norm = nn.utils.clip_grad_norm_(parameters, options.clip)
+        norm = nn.utils.clip_grad_norm_(self.parameters, self.options.clip)
         if torch.isfinite(norm):
-            optimizer.step(learning_rate_at(step, options))
-        averaged.update(module, step)
-        step += 1
-        for name, value in {
-            **{name: float(part.detach()) for name, part in parts.items()},
-            "norm": float(norm),
-        }.items():
-            mean[name] = 0.98 * mean.get(name, value) + 0.02 * value
-        if step % options.save_every == 0 or step == last:
-            minutes = spent + (time.process_time() - start) / 60
-            found = (
-                report(averaged.module, step) if report and (step % report_every == 0 or step == options.steps) else {}
-            )
-            _log(options.out / "log.jsonl", {"step": step, "cpu_minutes": minutes, **mean, **found})
-            _save(options.out / "checkpoint.pt", module, averaged, optimizer, step, minutes)
-    return averaged.module
+            self.optimizer.step(learning_rate_at(self.step, self.options))
+        self.averaged.update(self.module, self.step)
+        self.step += 1
+        now = {name: float(part.detach()) for name, part in parts.items()} | {"norm": float(norm)}
+        for name, value in now.items():
+            self.mean[name] = 0.98 * self.mean.get(name, value) + 0.02 * value
+
+    def save(self, found: dict[str, float]) -> None:
+        """Write the checkpoint, whole or not at all, and a row of log.jsonl with what validation found."""
+        self.minutes = (time.process_time() - self.began) / 60.0
+        row = {"step": self.step, "cpu_minutes": self.minutes, **self.mean, **found}
+        with (self.options.out / "log.jsonl").open("a") as file:
+            file.write(json.dumps({key: round(float(value), 6) for key, value in row.items()}) + "\n")
+        state = {
+            "module": self.module.state_dict(),
+            "averaged": self.averaged.module.state_dict(),
+            "optimizer": self.optimizer.state_dict(),
+            "step": self.step,
+            "cpu_minutes": self.minutes,
+        }
+        partial = self.checkpoint.with_suffix(".partial")
+        torch.save(state, partial)
+        partial.replace(self.checkpoint)
+
+    def _resume(self) -> None:
+        state = torch.load(self.checkpoint, weights_only=True)
+        self.module.load_state_dict(state["module"])
+        self.averaged.module.load_state_dict(state["averaged"])
+        try:
+            self.optimizer.load_state_dict(state["optimizer"])
+        except ValueError as error:
+            fix = "go on with the same optimizer, or in a new folder"
+            raise InputError(str(error), path=self.checkpoint, fix=fix) from error
+        self.step, self.minutes = int(state["step"]), float(state["cpu_minutes"])
 
 
 def _shown(numbers: range, options: StepOptions) -> Iterator[int]:
@@ -144,43 +181,8 @@ def _shown(numbers: range, options: StepOptions) -> Iterator[int]:
             advance(1)
 
 
-def _resume(path: Path, module: Network, averaged: Averaged[Network], optimizer: Optimizer) -> tuple[int, float]:
-    if not path.exists():
-        return 0, 0.0
-    state = torch.load(path, weights_only=True)
-    module.load_state_dict(state["module"])
-    averaged.module.load_state_dict(state["averaged"])
-    try:
-        optimizer.load_state_dict(state["optimizer"])
-    except ValueError as error:
-        raise InputError(str(error), path=path, fix="go on with the same optimizer, or in a new folder") from error
-    return int(state["step"]), float(state["cpu_minutes"])
-
-
-def _save(
-    path: Path,
-    module: Network,
-    averaged: Averaged[Network],
-    optimizer: Optimizer,
-    step: int,
-    minutes: float,
-) -> None:
-    state = {
-        "module": module.state_dict(), "averaged": averaged.module.state_dict(), "optimizer": optimizer.state_dict(),
-        "step": step, "cpu_minutes": minutes,
-    }  # fmt: skip
-    partial = path.with_suffix(".partial")
-    torch.save(state, partial)
-    partial.replace(path)
-
-
 def last_row(folder: Path) -> dict[str, float]:
     """Return the last row of a run's log.jsonl, {} where there is none."""
     path = folder / "log.jsonl"
     rows = path.read_text().splitlines() if path.exists() else []
     return dict(json.loads(rows[-1])) if rows else {}
-
-
-def _log(path: Path, row: dict[str, float]) -> None:
-    with path.open("a") as file:
-        file.write(json.dumps({key: round(float(value), 6) for key, value in row.items()}) + "\n")
