@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import tempfile
 import warnings
-from collections import Counter
+from collections import Counter, deque
 from collections.abc import Iterator
 from itertools import islice
 from pathlib import Path
@@ -40,34 +40,60 @@ def detect(
     options = options or DetectOptions()
     images = open_images(source, options.stamps, options.rate, options.keyframes)
     estimator = Estimator(options, images.intrinsics, images.path)
-    seconds: list[float] = []
-    counts = {"images": 0, "detections": 0}
-    known, unknown = _objects_of_map(Path(source), options), Counter[int]()
+    tally = _Tally(_objects_of_map(Path(source), options))
     with whole_folder(out, overwrite, inputs=[source]) as folder:
         files = PoseFiles(folder, options.scene)
-        skipped: list[str] = []
-        for sightings in _with_bar(_sightings(images, estimator, options.batch, skipped), images, progress):
-            if known is not None:
-                for sighting in sightings:
-                    unknown.update(sighting.object_ids[~np.isin(sighting.object_ids, known)].tolist())
-                sightings = [sighting.of_objects(known) for sighting in sightings]
-            files.append(sightings)
-            counts["images"] += len(sightings)
-            counts["detections"] += sum(len(s.labels) for s in sightings)
-            seconds = [*seconds[-999:], sightings[0].seconds]
+        for found in _with_bar(_sightings(images, estimator, options.batch, tally.skipped), images, progress):
+            kept = tally.kept(found)
+            files.append(kept)
             if options.overlays:
-                _draw(sightings, estimator, options, folder / "overlays")
-        if counts["images"] == 0:
+                _draw(kept, estimator, options, folder / "overlays")
+        if tally.images == 0:
             raise InputError("no image could be read", path=source)
         files.finish()
-        summary = {**counts, "skipped": skipped, "median_seconds_per_image": float(np.median(seconds))}
-        summary["not_on_the_map"] = {str(number): unknown[number] for number in sorted(unknown)}
-        (folder / "summary.json").write_text(json.dumps(summary, indent=1) + "\n")
-    if unknown:
-        which = ", ".join(f"{number} ({unknown[number]})" for number in sorted(unknown))
-        what = f"left out {unknown.total()} detections of objects that landmarks.json does not have: {which}"
-        warnings.warn(what, stacklevel=2)
+        (folder / "summary.json").write_text(json.dumps(tally.summary(), indent=1) + "\n")
+    tally.warn_of_unknown()
     return Path(out)
+
+
+class _Tally:
+    """What was found, what was left out, and how long it took."""
+
+    def __init__(self, known: NDArray[np.int64] | None) -> None:
+        """known: the map's objects, others are left out; None: all are kept."""
+        self.known, self.unknown = known, Counter[int]()
+        self.images, self.detections = 0, 0
+        self.skipped: list[str] = []
+        self.seconds: deque[float] = deque(maxlen=1000)
+
+    def kept(self, found: list[Sighting]) -> list[Sighting]:
+        """Count a group of pictures and return it without unknown objects."""
+        if self.known is not None:
+            for sighting in found:
+                self.unknown.update(sighting.object_ids[~np.isin(sighting.object_ids, self.known)].tolist())
+            found = [sighting.of_objects(self.known) for sighting in found]
+        self.images += len(found)
+        self.detections += sum(len(sighting.labels) for sighting in found)
+        self.seconds.append(found[0].seconds)
+        return found
+
+    def summary(self) -> dict[str, object]:
+        """Return what summary.json holds."""
+        return {
+            "images": self.images,
+            "detections": self.detections,
+            "skipped": self.skipped,
+            "median_seconds_per_image": float(np.median(self.seconds)),
+            "not_on_the_map": {str(number): self.unknown[number] for number in sorted(self.unknown)},
+        }
+
+    def warn_of_unknown(self) -> None:
+        """Warn, once, of objects that were left out."""
+        if not self.unknown:
+            return
+        which = ", ".join(f"{number} ({self.unknown[number]})" for number in sorted(self.unknown))
+        what = f"left out {self.unknown.total()} detections of objects that landmarks.json does not have: {which}"
+        warnings.warn(what, stacklevel=3)
 
 
 def detect_in_log(
