@@ -10,7 +10,7 @@ from pathlib import Path
 
 from poet_loc.check.doctor import Diagnosis, diagnose, write_repaired
 from poet_loc.check.finding import Finding
-from poet_loc.cli.arguments import LogFolder
+from poet_loc.cli.arguments import LogFolder, refuse_overwrite_without
 
 
 @dataclass(frozen=True)
@@ -28,6 +28,7 @@ class Arguments:
 
 def execute(arguments: Arguments) -> int:
     """Check, print, repair; return the exit status."""
+    refuse_overwrite_without(arguments.fix, "--fix", arguments.overwrite)
     diagnosis = diagnose(arguments.log)
     if arguments.json:
         print(json.dumps([finding.as_json() for finding in diagnosis.findings], indent=1))

@@ -9,7 +9,7 @@ from typing import Annotated
 
 import tyro
 
-from poet_loc.cli.arguments import Flat
+from poet_loc.cli.arguments import Flat, refuse_overwrite_without
 from poet_loc.cli.terminal import print_tables
 from poet_loc.core.input_error import InputError
 from poet_loc.io.whole_folder import whole_folder
@@ -35,6 +35,7 @@ class Arguments:
 
 def execute(arguments: Arguments) -> None:
     """Print the tables, and write them where asked."""
+    refuse_overwrite_without(arguments.out, "--out", arguments.overwrite)
     if arguments.options.scene is not None and not any(path.suffix == ".json" for path in arguments.results):
         raise InputError("--scene changes nothing: BOP results tell theirs", fix="leave it out")
     found = evaluate_poses(arguments.results, arguments.truth, arguments.options)

@@ -10,7 +10,7 @@ from typing import Annotated
 import tyro
 
 from fusion.fit_noise import FitNoiseOptions, FittedNoise, fit_noise
-from poet_loc.cli.arguments import Flat
+from poet_loc.cli.arguments import Flat, refuse_overwrite_without
 from poet_loc.cli.noise_file import noise_text
 from poet_loc.io.log_folder import read_log
 from poet_loc.io.whole_folder import not_there, write_whole_file
@@ -33,6 +33,7 @@ class Arguments:
 
 def execute(arguments: Arguments) -> None:
     """Fit, print the parts, and write the file that was asked for."""
+    refuse_overwrite_without(arguments.out, "--out", arguments.overwrite)
     if arguments.out is not None:
         not_there(arguments.out, arguments.overwrite)
     logs = (read_log(path, arguments.detections) for path in arguments.logs)

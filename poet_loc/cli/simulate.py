@@ -13,7 +13,7 @@ from fusion.monte_carlo import simulate_runs
 from fusion.simulate import SimulationOptions, simulate
 from fusion.simulation_options import refuse_unread as refuse_unread_by_simulation
 from landmarks.options import Mode
-from poet_loc.cli.arguments import Flat
+from poet_loc.cli.arguments import Flat, refuse_overwrite_without
 from poet_loc.cli.estimates import FUSIONS, Fusion, StageOptions, estimate_log, refuse_one_estimator
 from poet_loc.cli.terminal import Silent, print_tables
 from poet_loc.cli.unread import refuse_unread
@@ -55,6 +55,7 @@ def execute(arguments: Arguments) -> None:
     if arguments.out is None and arguments.runs < 1:
         raise InputError("nothing to do", fix="give --out LOG, --runs N, or both")
     refuse_unread_by_simulation(arguments.simulation)
+    refuse_overwrite_without(arguments.out, "--out", arguments.overwrite)
     _refuse_unread(arguments)
     if arguments.out is not None:
         with whole_folder(arguments.out, arguments.overwrite) as folder:

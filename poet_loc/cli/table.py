@@ -12,7 +12,7 @@ from typing import Annotated, Literal
 import tyro
 
 from landmarks.options import MODES, Mode
-from poet_loc.cli.arguments import Flat
+from poet_loc.cli.arguments import Flat, refuse_overwrite_without
 from poet_loc.cli.estimates import FUSIONS, Fusion, StageOptions, estimate_log, refuse_one_estimator, steps
 from poet_loc.cli.sensitivity_table import sensitivity_rows, sensitivity_tables, sensitivity_text
 from poet_loc.cli.terminal import Report, print_tables, progress
@@ -60,6 +60,7 @@ def execute(arguments: Arguments) -> None:
     """Compute the table and print or write it."""
     if not arguments.logs:
         raise InputError("no log was named", fix="poet-loc table LOG [LOG ..]")
+    refuse_overwrite_without(arguments.out, "--out", arguments.overwrite)
     refuse_one_estimator(arguments.options.fusion)
     form = _form(arguments)
     logs = [read_log(path) for path in arguments.logs]

@@ -13,6 +13,7 @@ from typing import Annotated
 
 import tyro
 
+from poet_loc.cli.arguments import refuse_overwrite_without
 from poet_loc.core.input_error import InputError
 
 
@@ -35,8 +36,7 @@ def execute(arguments: Arguments) -> None:
     recordings = [_recording(run) for run in arguments.runs]
     if not recordings:
         raise InputError("no run was named", fix="poet-loc view RUN [RUN ..]")
-    if arguments.save is None and arguments.overwrite:
-        raise InputError("--overwrite changes nothing without --save", fix="leave it out")
+    refuse_overwrite_without(arguments.save, "--save", arguments.overwrite)
     if arguments.save is not None and arguments.web:
         raise InputError("--save opens nothing, --web does", fix="leave out one of them")
     if arguments.save is not None:

@@ -160,7 +160,17 @@ def choose_topics(topics: list[BagTopic], options: ConvertRosbagOptions, bag: Pa
     if not chosen:
         listed = ", ".join(f"{topic.name} ({topic.message_type})" for topic in topics) or "none"
         raise InputError(f"no topic was chosen or guessed among {listed}", path=bag, fix="name topics, see --help")
+    _refuse_unread(options, chosen, bag)
     return chosen
+
+
+def _refuse_unread(options: ConvertRosbagOptions, chosen: Mapping[str, str], bag: Path) -> None:
+    """Raise InputError for an option about a topic that is not there."""
+    asked = {"--extract-images": ("images", options.extract_images), "--classes": ("detections", options.classes)}
+    for flag, (role, given) in asked.items():
+        if given and role not in chosen:
+            what = f"{flag} changes nothing: no topic was chosen or guessed for --{role}"
+            raise InputError(what, path=bag, fix="name the topic, or leave it out")
 
 
 def _read(

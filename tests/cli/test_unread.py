@@ -126,6 +126,8 @@ def test_further_commands(log, capsys, tmp_path):
     (tmp_path / "run").mkdir()
     (tmp_path / "run" / "recording.rrd").write_bytes(b"")
     assert "--overwrite changes nothing without --save" in told(capsys, "view", tmp_path / "run", "--overwrite")
+    assert "--overwrite changes nothing without --out" in told(capsys, "table", log, "--overwrite")
+    assert "--overwrite changes nothing without --fix" in told(capsys, "check", log, "--overwrite")
     line = told(capsys, "view", tmp_path / "run", tmp_path / "run", "--web", "--save", tmp_path / "c.rrd")
     assert "--save opens nothing" in line
     given = ["evaluate-poses", tmp_path / "r.csv", "--truth", split, "--models", split]

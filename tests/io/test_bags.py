@@ -222,6 +222,8 @@ def test_what_is_wrong_with_topics_is_one_line(tmp_path) -> None:
         (ConvertRosbagOptions(imu="/odom"), "topic /odom is nav_msgs/Odometry"),
         (ConvertRosbagOptions(truth_cam="/tf"), "holds many frames"),
         (ConvertRosbagOptions(), "has no object id"),
+        (ConvertRosbagOptions(images="none", extract_images=True), "--extract-images changes nothing: no topic"),
+        (ConvertRosbagOptions(detections="none", classes=tmp_path / "c.json"), "--classes changes nothing: no topic"),
         (ConvertRosbagOptions(typestore="ros3"), "unknown type store"),
     ):
         with pytest.raises(InputError, match=words):
