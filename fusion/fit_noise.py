@@ -3,13 +3,17 @@
 The errors of each object (rotation in rad; image shift and stretch of the distance as shares of it, as in
 `fusion/measurements.py`) have the autocovariance  w^2 [lag = 0] + v^2 exp(-lag / tau) + s^2, whose parts are the white
 noise, the varying and the steady bias. Gross errors are left out and counted: the gate and the jumps deal with them.
+
+What an object's errors have in common from log to log is its mean error, which a filter can take off beforehand; it
+is shrunk towards zero by what the scatter between logs leaves uncertain of it (random effects, variances by the method
+of moments). The three parts are then those of what the other logs' mean error leaves of each: what a new log brings.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,6 +27,7 @@ from poet_loc.io.log_folder import Log
 
 Array = NDArray[np.float64]
 Stamps = NDArray[np.int64]
+Track = tuple[Stamps, Array]
 
 PARTS = {"rotation": slice(0, 3), "across": slice(3, 5), "along": slice(5, 6)}
 
@@ -65,6 +70,8 @@ class FittedNoise:
     """Share of the detections that are gross errors."""
     detections: int
     """How many the fit stands on."""
+    means: dict[int, Array] = field(default_factory=dict)
+    """By object id, of objects in two logs or more: the mean error (6,) that a new log will have too."""
 
     def options(self) -> tuple[DetectionNoise, DetectionBias]:
         """Return the options that a filter needs to know of it; the noise floor near an object stays the default."""
@@ -80,6 +87,7 @@ class FittedNoise:
             steady_across=across.steady,
             steady_along=along.steady,
             steady_rotation_deg=math.degrees(rotation.steady),
+            means=tuple(_row_of_means(object_id, mean) for object_id, mean in sorted(self.means.items())),
         )
         return noise, bias
 
@@ -94,28 +102,66 @@ def fit_noise(
     options = options or FitNoiseOptions()
     lags = (np.arange(1, max(2, round(options.longest_lag_s / _STEP_S))) * _STEP_S).astype(np.float64)
     sums, counts = np.zeros((6, len(lags) + 1)), np.zeros(len(lags) + 1)
-    good = seen = 0
-    for log in logs:
-        for stamps, errors in _object_errors(log, log.detections(detections)[1]):
-            keep = _is_good(errors, options)
-            seen += len(keep)
-            if np.count_nonzero(keep) < options.min_detections:
-                continue
-            good += int(np.count_nonzero(keep))
-            _add_autocovariance(stamps[keep], errors[keep], sums, counts)
-    if counts[0] == 0:
+    found, seen = _good_errors(logs, detections, options)
+    good = sum(len(stamps) for tracks in found.values() for stamps, _ in tracks)
+    if good == 0:
         raise InputError(f"no object has {options.min_detections} good detections", fix="give longer logs")
+    shrunk = _shrinkage({key: np.array([errors.mean(axis=0) for _, errors in tracks]) for key, tracks in found.items()})
+    means = {}
+    for object_id, tracks in found.items():
+        each = np.array([errors.mean(axis=0) for _, errors in tracks])
+        for i, (stamps, errors) in enumerate(tracks):
+            others = np.delete(each, i, axis=0)
+            known = shrunk[object_id] * others.mean(axis=0) if len(others) else 0.0
+            _add_autocovariance(stamps, errors - known, sums, counts)
+        if len(tracks) > 1:
+            means[object_id] = shrunk[object_id] * each.mean(axis=0)
     covariance = sums / np.maximum(counts, 1)
     usable = np.r_[True, counts[1:] > options.min_detections]
     parts = {name: _fit_part(covariance[part], lags, usable) for name, part in PARTS.items()}
-    return FittedNoise(parts, 1.0 - good / seen, good)
+    return FittedNoise(parts, 1.0 - good / seen, good, means)
+
+
+def _row_of_means(object_id: int, mean: Array) -> tuple[int, float, float, float, float, float, float]:
+    x, y, z, *place = (round(float(value), 6) + 0.0 for value in np.r_[np.degrees(mean[:3]), mean[3:]])
+    return object_id, x, y, z, place[0], place[1], place[2]
+
+
+def _good_errors(
+    logs: Iterable[Log], detections: str | None, options: FitNoiseOptions
+) -> tuple[dict[int, list[Track]], int]:
+    """Return by object id what is no gross error, log by log, and how many detections there are in all."""
+    found: dict[int, list[Track]] = {}
+    seen = 0
+    for log in logs:
+        for object_id, stamps, errors in _object_errors(log, log.detections(detections)[1]):
+            keep = _is_good(errors, options)
+            seen += len(keep)
+            if np.count_nonzero(keep) >= options.min_detections:
+                found.setdefault(object_id, []).append((stamps[keep], errors[keep]))
+    return found, seen
+
+
+def _shrinkage(means: dict[int, Array]) -> dict[int, Array]:
+    """Return by object what of its mean over logs (n, 6) is to be believed, (6,): tau^2 / (tau^2 + s^2 / n).
+
+    s^2 is the variance of an object's means between logs, tau^2 that of the objects' own means about zero.
+    Source: B. Efron and C. Morris, "Stein's estimation rule and its competitors", JASA 68 (1973), section 2.
+    """
+    several = [each for each in means.values() if len(each) > 1]
+    if not several:
+        return {key: np.zeros(6) for key in means}
+    between = np.mean([each.var(axis=0, ddof=1) for each in several], axis=0)
+    own = np.mean([each.mean(axis=0) ** 2 - between / len(each) for each in several], axis=0)
+    own = np.maximum(own, 0.0)
+    return {key: own / np.maximum(own + between / len(each), 1e-30) for key, each in means.items()}
 
 
 _STEP_S = 0.1
 
 
-def _object_errors(log: Log, poses: ObjectPoses) -> Iterator[tuple[Stamps, Array]]:
-    """Yield stamps (N,) and errors (N, 6) [rotation, across x, across y, along] of each object of a log."""
+def _object_errors(log: Log, poses: ObjectPoses) -> Iterator[tuple[int, Stamps, Array]]:
+    """Yield id, stamps (N,) and errors (N, 6) [rotation, across x, across y, along] of each object of a log."""
     if log.T_world_cam is None or log.landmark_map is None:
         raise InputError("fitting needs T_world_cam.tum and landmarks.json", path=log.path, fix="choose another log")
     T_world_cam, valid = log.T_world_cam.interpolate(poses.stamps_ns, max_gap_ns=200_000_000)
@@ -131,7 +177,7 @@ def _object_errors(log: Log, poses: ObjectPoses) -> Iterator[tuple[Stamps, Array
         p, shift = truth.translation, measured.translation - truth.translation
         along = np.sum(p * shift, axis=1) / np.sum(p * p, axis=1)
         across = (shift - along[:, None] * p)[:, :2] / p[:, 2:]
-        yield poses.stamps_ns[mine], np.column_stack([rotation, across, along])
+        yield thing.object_id, poses.stamps_ns[mine], np.column_stack([rotation, across, along])
 
 
 def _is_good(errors: Array, options: FitNoiseOptions) -> NDArray[np.bool_]:

@@ -25,6 +25,7 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from fusion import memory, replay, replay_memory
 from fusion.bias_spread import white_part
 from fusion.health import Mode, ObjectHealth, mode_of
+from fusion.known_errors import known_errors
 from fusion.measurements import (
     BEFORE_POSES,
     CAMERA_POSE,
@@ -158,6 +159,7 @@ class Estimator:
         self.memory = memory.views.py_func(self._floats, self._integers)
         self._shift_ns = time_shift_ns(calibration)
         self._landmarks = _landmark_numbers(self.keys)
+        self._known_errors = known_errors(self.options.bias, landmark_map)
         noise = self.options.camera_noise
         self._camera_covariance = np.diag(
             np.repeat(np.array([math.radians(noise.rotation_deg), noise.position]) ** 2, 3)
@@ -221,6 +223,7 @@ class Estimator:
         if not usable.all():
             landmarks, q, t = landmarks[usable], q[usable], t[usable]
             stated = None if stated is None else stated[usable]
+        q, t = self._without_known_errors(landmarks, q, t)
         self._feed_poses(stamp_ns, OBJECT_POSE, landmarks, q, t, self._detection_covariances(t, stated))
 
     def feed_camera_pose(
@@ -311,6 +314,15 @@ class Estimator:
         if rows[-1, POSES]:
             found[-1, 0] = _object_health(rows[-1], False)
         return found
+
+    def _without_known_errors(self, landmarks: NDArray[np.int64], q: Array, t: Array) -> tuple[Array, Array]:
+        rows = (q != 0.0).any(axis=1) & np.isfinite(q).all(axis=1)  # others are refused later
+        if self._known_errors is None or not rows.any():
+            return q, t
+        q, t = q.copy(), t.copy()
+        R, t[rows] = self._known_errors.taken_off(landmarks[rows], Rotation.from_quat(q[rows]), t[rows])
+        q[rows] = R.as_quat()
+        return q, t
 
     def _detection_covariances(self, t: Array, covariances: Array | None) -> Array:
         noise, places = self.options.noise, np.where(np.isfinite(t), t, 1.0)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 from poet_loc.core.input_error import InputError, within
 
 RANGES: dict[str, tuple[str, ...]] = {
@@ -109,6 +111,14 @@ def refuse_impossible(options: object) -> None:
     """Raise InputError for a number of `FuseOptions` outside its range, and for detections without any noise."""
     for interval, names in RANGES.items():
         within(interval, options, *names)
-    noise = options.noise  # type: ignore[attr-defined]
+    noise, means = options.noise, options.bias.means  # type: ignore[attr-defined]
+    for row in means:
+        if not all(map(math.isfinite, row)) or max(map(abs, row[1:4])) > 90.0 or max(map(abs, row[4:])) > 0.5:
+            raise InputError(
+                f"bias.means of object {row[0]} is {row[1:]}",
+                fix="give three angles, at most 90 deg, and three shares of the distance, at most 0.5",
+            )
+    if len({row[0] for row in means}) < len(means):
+        raise InputError("bias.means has an object twice", fix="give each object one mean error")
     if noise.floor + min(noise.across, noise.along) == 0.0:
         raise InputError("noise.floor is 0 and so is another part of the noise", fix="give one of them more than 0")

@@ -70,6 +70,10 @@ class DetectionBias:
     """The same along the ray."""
     steady_rotation_deg: float = 3.0
     """The same in rotation per axis, deg."""
+    means: tuple[tuple[int, float, float, float, float, float, float], ...] = ()
+    """What is known of the steady one, and taken off the detections: for each object its id and the mean error of its
+    rotation x y z, deg in camera axes, and of its place across the ray x y and along it, shares of the distance.
+    `fit-noise` finds it from two logs or more; the steady 1-sigma is then of what is left."""
     jump_after: int = 20
     """An object refused so often in a row has another bias: the old one is forgotten."""
     jump: float = 5.0

@@ -14,6 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from fusion import ballot, filter_update, imu, meeting, memory, object_biases, odometry, place_watch
 from fusion.bias_spread import spread_model, white_part
+from fusion.known_errors import known_errors
 from fusion.measurements import CAMERA_POSE, OBJECT_POSE, Measurements, ray_aligned_covariance
 from fusion.motion_source import Kind, motion_source, odometry_steps
 from fusion.nav_state import ACCEL_BIAS_ERROR, CORE, GYRO_BIAS_ERROR, VELOCITY_ERROR, StateLayout, nominal_state
@@ -111,8 +112,10 @@ def object_measurements(
     poses, landmark = poses[usable], landmark[usable]
     order = np.lexsort((landmark, poses.stamps_ns))
     poses, landmark = poses[order], landmark[order]
-    noise = options.noise
-    t = poses.T_cam_obj.translation
+    noise, known = options.noise, known_errors(options.bias, landmark_map)
+    R, t = poses.T_cam_obj.rotation, poses.T_cam_obj.translation
+    if known is not None:
+        R, t = known.taken_off(landmark, R, t)
     covariances = ray_aligned_covariance(t, noise.across, noise.along, math.radians(noise.rotation_deg), noise.floor)
     if poses.covariances is not None:
         given = np.isfinite(poses.covariances).all(axis=(1, 2))
@@ -121,7 +124,7 @@ def object_measurements(
         poses.stamps_ns + time_shift_ns(calibration),
         np.full(len(poses), OBJECT_POSE, dtype=np.int64),
         landmark,
-        poses.T_cam_obj.rotation.as_matrix().reshape(-1, 9),
+        R.as_matrix().reshape(-1, 9),
         np.ascontiguousarray(t),
         covariances,
     )

@@ -55,4 +55,10 @@ def _lines(fitted: FittedNoise) -> list[str]:
         unit, scale = units[name]
         sizes = (scale * part.white, scale * part.varying, part.correlation_s, scale * part.steady)
         lines.append(f"{name + ', ' + unit:<22}{sizes[0]:9.3f}{sizes[1]:9.3f}{sizes[2]:6.1f} s{sizes[3]:9.3f}")
+    means = fitted.options()[1].means
+    if means:
+        lines.append(f"{'mean error of object':<22}{'rotation x y z, deg':>27}{'across x y, along, %':>29}")
+    for object_id, *mean in means:
+        shares = "".join(f"{100.0 * share:9.2f}" for share in mean[3:])
+        lines.append(f"{object_id:<22}" + "".join(f"{angle:9.2f}" for angle in mean[:3]) + f"  {shares}")
     return lines

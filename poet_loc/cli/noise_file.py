@@ -17,7 +17,7 @@ Group = TypeVar("Group", DetectionNoise, DetectionBias)
 
 def noise_text(noise: DetectionNoise, bias: DetectionBias) -> str:
     """Return what `with_noise_from` reads: YAML with every option of both groups."""
-    return yaml.safe_dump({"noise": asdict(noise), "bias": asdict(bias)}, sort_keys=False)
+    return yaml.safe_dump({"noise": asdict(noise), "bias": asdict(bias)}, sort_keys=False, default_flow_style=None)
 
 
 def with_noise_from(path: Path | None, options: FuseOptions) -> FuseOptions:
@@ -52,6 +52,22 @@ def _changed(group: Group, values: Any, path: Path) -> Group:
     for name, value in values.items():
         if name not in known:
             raise InputError(f"unknown option '{name}'", path=path, fix=f"one of {', '.join(known)}")
-        if isinstance(value, bool) != (known[name] is bool) or not isinstance(value, (bool, int, float)):
+        if name != "means" and (
+            isinstance(value, bool) != (known[name] is bool) or not isinstance(value, (bool, int, float))
+        ):
             raise InputError(f"{name} is {value!r}", path=path, fix=f"give it a {known[name].__name__}")
+    if "means" in values:
+        values = {**values, "means": _rows(values["means"], path)}
     return replace(group, **values)
+
+
+def _rows(value: Any, path: Path) -> tuple[tuple[Any, ...], ...]:
+    rows: list[Any] = value if isinstance(value, list) else [value]
+    for row in rows:
+        if not isinstance(row, list) or len(row) != 7 or not isinstance(row[0], int) or not _are_numbers(row):
+            raise InputError(f"means has {row!r}", path=path, fix="give each object its id and six numbers")
+    return tuple((row[0], *map(float, row[1:])) for row in rows)
+
+
+def _are_numbers(row: list[Any]) -> bool:
+    return all(isinstance(each, (int, float)) and not isinstance(each, bool) for each in row)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from typing import Annotated, Literal
@@ -14,6 +14,7 @@ import tyro
 from landmarks.options import MODES, Mode
 from poet_loc.cli.arguments import Flat, refuse_overwrite_without
 from poet_loc.cli.estimates import FUSIONS, Fusion, StageOptions, estimate_log, refuse_one_estimator, steps
+from poet_loc.cli.noise_file import with_noise_from
 from poet_loc.cli.sensitivity_table import sensitivity_rows, sensitivity_tables, sensitivity_text
 from poet_loc.cli.terminal import Report, print_tables, progress
 from poet_loc.cli.unread import refuse_unread
@@ -43,6 +44,8 @@ class Arguments:
     """Also fuse, and add a row for each of --fusions."""
     fusions: tuple[Fusion, ...] = FUSIONS
     """Estimators and what they fuse."""
+    noise_from: Path | None = None
+    """Noise and bias of the detections from this file, as fit-noise writes it."""
     sensitivity: bool = False
     """Instead: how the errors of the modes depend on the solver's options, one changed at a time."""
     pooled_only: bool = False
@@ -65,6 +68,8 @@ def execute(arguments: Arguments) -> None:
     form = _form(arguments)
     logs = [read_log(path) for path in arguments.logs]
     _refuse_unread(arguments, logs)
+    fusion = with_noise_from(arguments.noise_from, arguments.options.fusion)
+    arguments = replace(arguments, options=replace(arguments.options, fusion=fusion))
     if arguments.sensitivity:
         rows = sensitivity_rows(logs, detection_sets(logs, arguments.detections))
         tables, text = sensitivity_tables(rows), partial(sensitivity_text, rows)
@@ -89,7 +94,7 @@ def _refuse_unread(arguments: Arguments, logs: Sequence[Log]) -> None:
     if arguments.fusions != FUSIONS and not arguments.with_fusion:
         raise InputError("--fusions changes nothing without --with-fusion", fix="add it")
     fusions = arguments.fusions if arguments.with_fusion else ()
-    refuse_unread(arguments.options, logs, arguments.modes, fusions, arguments.detections)
+    refuse_unread(arguments.options, logs, arguments.modes, fusions, arguments.detections, arguments.noise_from)
 
 
 def _form(arguments: Arguments) -> Format:

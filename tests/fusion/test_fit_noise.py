@@ -21,21 +21,25 @@ VARYING = np.array([0.05, 0.05, 0.05, 0.006, 0.006, 0.03])
 TAU = np.array([4.0, 4.0, 4.0, 2.0, 2.0, 1.0])
 
 
-def made_log(seed: int, frames: int = 3000) -> Log:
-    """A camera at rest before one object, whose errors are white noise and a Gauss-Markov bias."""
+MEANS = {1: np.array([0.05, -0.08, 0.02, 0.004, 0.01, -0.04]), 2: np.array([-0.03, 0.04, 0.0, -0.006, 0.008, 0.03])}
+SCATTER = np.array([0.01, 0.01, 0.01, 0.001, 0.001, 0.004])
+
+
+def made_log(seed: int, frames: int = 3000, object_id: int = 1, mean: np.ndarray | float = 0.0) -> Log:
+    """A camera at rest before one object, whose errors are white noise, a Gauss-Markov bias and what they all share."""
     rng = np.random.default_rng(seed)
     stamps = np.arange(frames, dtype=np.int64) * 33_333_333
     phi = np.exp(-0.033333333 / TAU)
     bias, errors = VARYING * rng.normal(size=6), np.zeros((frames, 6))
     for i in range(frames):
         bias = phi * bias + np.sqrt(1 - phi**2) * VARYING * rng.normal(size=6)
-        errors[i] = bias + WHITE * rng.normal(size=6)
+        errors[i] = mean + bias + WHITE * rng.normal(size=6)
     p = np.array([0.0, 0.0, 1.2])
     t = p + np.column_stack([errors[:, 3] * p[2], errors[:, 4] * p[2], errors[:, 5] * p[2]])
     T_cam_obj = make_pose(Rotation.from_rotvec(errors[:, :3]), t)
     zeros = np.zeros(frames, dtype=np.int64)
-    poses = ObjectPoses(stamps, np.arange(frames), zeros + 1, zeros, np.ones(frames), T_cam_obj)
-    world = LandmarkMap((Landmark(1, make_pose(Rotation.identity(), p)),))
+    poses = ObjectPoses(stamps, np.arange(frames), zeros + object_id, zeros, np.ones(frames), T_cam_obj)
+    world = LandmarkMap((Landmark(object_id, make_pose(Rotation.identity(), p)),))
     still = Trajectory(stamps, RigidTransform.from_translation(np.zeros((frames, 3))))
     return Log(Path("made"), {"": poses}, world, T_world_cam=still)
 
@@ -81,3 +85,31 @@ def test_real_networks_err_mostly_in_depth_and_for_long(shared_data):
     lasting = {name: np.hypot(part.varying, part.steady) for name, part in parts.items()}
     assert lasting["along"] > 2 * lasting["across"]
     assert all(lasting[name] > parts[name].white for name in parts)
+
+
+def test_mean_errors_of_objects_are_found_and_what_scatters_about_them_is_steady():
+    rng, logs = np.random.default_rng(3), []
+    for object_id, mean in MEANS.items():
+        logs += [made_log(10 * object_id + i, 2000, object_id, mean + SCATTER * rng.normal(size=6)) for i in range(5)]
+    fitted = fit_noise(logs)
+    for object_id, mean in MEANS.items():
+        np.testing.assert_array_less(np.abs(fitted.means[object_id] - mean), 0.35 * VARYING)
+    unaware = [fit_noise([log]) for log in logs]
+    for name in ("rotation", "along"):
+        slow = np.hypot(fitted.parts[name].varying, fitted.parts[name].steady)
+        whole = np.mean([np.hypot(one.parts[name].varying, one.parts[name].steady) for one in unaware])
+        assert slow < 0.85 * whole
+
+
+def test_what_scatters_from_log_to_log_is_hardly_taken_for_a_mean_error():
+    rng, size = np.random.default_rng(4), np.array([0.1, 0.1, 0.1, 0.01, 0.01, 0.03])
+    drawn = {object_id: size * rng.normal(size=(4, 6)) for object_id in range(1, 7)}
+    logs = [made_log(10 * k + i, 1000, k, mean) for k, each in drawn.items() for i, mean in enumerate(each)]
+    fitted = fit_noise(logs)
+    believed = np.array([fitted.means[k] / size for k in drawn])
+    averages = np.array([each.mean(axis=0) / size for each in drawn.values()])
+    assert np.mean(believed**2) < 0.3 * np.mean(averages**2)
+
+
+def test_one_log_tells_no_mean_error():
+    assert fit_noise([made_log(0, 1000, 1, MEANS[1])]).means == {}

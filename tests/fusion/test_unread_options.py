@@ -24,6 +24,7 @@ OTHER = {
     "estimate.map": "approximate",
     "gate.probability": 0.5,
     "bias.correlation_across_s": 0.2,
+    "bias.means": tuple((k, 5.0, 0.0, 0.0, 0.0, 0.01, 0.02) for k in range(1, 20)),
     "bias.correlation_along_s": 0.2,
     "bias.correlation_rotation_s": 0.2,
     "start.min_votes": 30,
