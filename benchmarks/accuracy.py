@@ -1,8 +1,8 @@
 """The accuracy tables of the documentation: each prints the commands that make it, then what they print.
 
-    python benchmarks/accuracy.py [white network real fitted odometry euroc calibration map] [--runs 50] [--shared DATA]
+    python benchmarks/accuracy.py [white network real odometry fitted euroc calibration map] [--runs 50] [--shared DATA]
 
-Simulated tables need nothing else; `real`, `fitted`, `odometry`, `euroc`, half of `calibration` need reference logs.
+Simulated tables need nothing else; `real`, `odometry`, `fitted`, `euroc`, half of `calibration` need reference logs.
 """
 
 from __future__ import annotations
@@ -59,8 +59,13 @@ def real(asked: argparse.Namespace) -> None:
         table_of(asked, logs, "--fusions", *FUSIONS)
 
 
+def odometry(asked: argparse.Namespace) -> None:
+    """The same with the real visual odometry as the source of motion."""
+    table_of(asked, TEST_LOGS, "--fusions", "eskf/objects", "graph/objects", "--fusion.motion", "odometry")
+
+
 def fitted(asked: argparse.Namespace) -> None:
-    """The same with each network's noise and mean errors as `fit-noise` finds them on the training videos."""
+    """Each network's own noise and mean errors, as fit-noise finds them on the training videos, on the test videos."""
     training = [str(asked.shared / "ycbv_dope" / log) for log in TRAINING_LOGS]
     with tempfile.TemporaryDirectory() as folder:
         for name in ("selftrained", "supervised", "synthetic"):
@@ -68,11 +73,6 @@ def fitted(asked: argparse.Namespace) -> None:
             command("fit-noise", *training, "--detections", name, "--out", file)
             from_it = ("--detections", name, "--modes", "best", "--noise-from", file)
             table_of(asked, TEST_LOGS, *from_it, "--fusions", "eskf/objects", "graph/objects")
-
-
-def odometry(asked: argparse.Namespace) -> None:
-    """The same with the real visual odometry as the source of motion."""
-    table_of(asked, TEST_LOGS, "--fusions", "eskf/objects", "graph/objects", "--fusion.motion", "odometry")
 
 
 def euroc(asked: argparse.Namespace) -> None:
@@ -198,8 +198,8 @@ TABLES: dict[str, Callable[[argparse.Namespace], None]] = {
     "white": white,
     "network": network,
     "real": real,
-    "fitted": fitted,
     "odometry": odometry,
+    "fitted": fitted,
     "euroc": euroc,
     "calibration": calibration_,
     "map": map_,
