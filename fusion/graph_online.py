@@ -27,7 +27,7 @@ from fusion.fuse import loop_columns
 from fusion.graph_fixed import new_builder
 from fusion.graph_motion import MotionChain
 from fusion.graph_smoother import FixedLagSmoother
-from fusion.graph_walk import IMU_ROW, NEXT, ROWS, Walk
+from fusion.graph_walk import HERE, IMU_ROW, NEXT, ROWS, Walk
 from fusion.imu_noise import REACH, follow_noise
 from fusion.measurements import Measurements
 from fusion.nav_state import StateLayout
@@ -237,7 +237,7 @@ class GraphEstimator(Estimator):
         for kept in self._kept:
             kept.first = max(0, kept.first - poses)
         for cursor in (self._walk.cursor, *(kept.cursor for kept in self._kept)):
-            cursor[[IMU_ROW, NEXT]] -= (samples, poses)
+            cursor[[IMU_ROW, NEXT, HERE]] -= (samples, poses, poses)
         for integers in (self._walk.integers, *(kept.integers for kept in self._kept)):
             integers[imu_at] -= samples
 

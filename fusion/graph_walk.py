@@ -73,7 +73,7 @@ def filter_until_keyframe(
     """
     m = views(floats, integers)
     w = work_views(m.work, len(m.P))
-    if cursor[CORRECTED] == 1:
+    if cursor[CORRECTED] == 1 and cursor[ROWS] > 0:
         emit(m, rows, cursor[ROWS] - 1)
     cursor[CORRECTED] = cursor[JUMPED] = 0
     while cursor[IMU_ROW] < len(log.imu_stamps):

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import fields, replace
 
 import numpy as np
 import pytest
@@ -12,6 +12,7 @@ from test_online import stated_for
 
 from fusion.graph import run_graph
 from fusion.graph_online import GraphEstimator
+from fusion.measurements import Measurements
 from fusion.online import OnlineOptions
 from fusion.options import Estimate, FuseOptions, Graph
 from fusion.prepare import time_shift_ns
@@ -122,6 +123,22 @@ def test_buffers_turn_over_and_nothing_grows():
     assert len(feed.estimator._kept) < 60
     assert feed.estimator._samples < 400
     assert_same_state(states[last], whole, 1e-9)
+
+
+def test_poses_with_pauses_while_buffers_turn_over():
+    """Keyframes without poses, poses between keyframes, and room for four seconds of them in a log of twelve."""
+    options = replace(OPTIONS, graph=Graph(lag_s=0.4, keyframe_rate_hz=4.0, idle_s=0.3))
+    problem = simulated(options=options, duration_s=12.0)
+    m = problem.measurements
+    seconds = (m.stamps_ns - m.stamps_ns[0]) * 1e-9
+    kept = (seconds < 2.5) | (seconds % 0.9 < 0.35)
+    seen = Measurements(*(getattr(m, each.name)[kept] for each in fields(m)))
+    problem = replace(problem, measurements=seen)
+    feed = Feed(problem, options, ahead_s=0.1, max_pose_rate_hz=25.0, max_imu_rate_hz=70.0)
+    last = problem.imu.stamps_ns[-2]
+    states = feed.all(np.zeros(len(seen)), last)
+    assert feed.estimator.health().overflowed == 0
+    assert_same_state(states[last], run_graph(problem, options), 1e-9)
 
 
 def test_an_approximate_map_and_calibration_come_out_the_same():
