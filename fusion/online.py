@@ -316,9 +316,9 @@ class Estimator:
         return found
 
     def _without_known_errors(self, landmarks: NDArray[np.int64], q: Array, t: Array) -> tuple[Array, Array]:
-        rows = (q != 0.0).any(axis=1) & np.isfinite(q).all(axis=1)  # others are refused later
-        if self._known_errors is None or not rows.any():
+        if self._known_errors is None:
             return q, t
+        rows = (q != 0.0).any(axis=1) & np.isfinite(q).all(axis=1)  # others are refused later
         q, t = q.copy(), t.copy()
         R, t[rows] = self._known_errors.taken_off(landmarks[rows], Rotation.from_quat(q[rows]), t[rows])
         q[rows] = R.as_quat()
