@@ -22,6 +22,9 @@ from fusion.options import DetectionBias, DetectionNoise
 
 Array = NDArray[np.float64]
 
+LEAST_VARIANCE = 1e-10
+"""A detection that calls itself more exact than this, rad^2 and m^2, has this added: its rows would be singular."""
+
 # Places in what the filter knows of the white noise of detections that state none, and how many make a mean.
 WHITE_ROTATION, WHITE_ACROSS, WHITE_ALONG, WHITE_FLOOR, MEAN_OVER = range(5)
 
@@ -38,6 +41,7 @@ def white_part(covariances: Array, translations: Array, noise: DetectionNoise, b
     Without biases all is white.
     """
     S = covariances * noise.stated_scale**2
+    S[np.linalg.eigvalsh(S)[:, 0] < LEAST_VARIANCE] += LEAST_VARIANCE * np.eye(6)
     if not bias.use:
         return S
     squared = np.sum(translations**2, axis=1)

@@ -265,6 +265,12 @@ def restart_if_lost(m: Memory, w: Work) -> None:
         return
     m.up[0], m.up[1], m.up[2] = 0.0, 0.0, 1.0
     count = _agreement(m, w, first, False)[0]
+    if count < m.start[LOST_MIN_VOTES] and used == 0.0 and since_start >= m.start[LOST_WINDOW_S]:
+        # Nothing was used for so long: the attitude itself may be wrong, and has no say where most votes agree.
+        m.up[2] = 0.0
+        count = _agreement(m, w, first, False)[0]
+        if 2 * count < head - first:
+            return
     if count >= m.start[LOST_MIN_VOTES] and count > 3.0 * used and not _is_contested(m, w, first):
         adopt(m, w, GYRO_BIAS_ERROR)
         m.counters[RESTARTS] += 1

@@ -132,3 +132,14 @@ def test_measurements_carry_the_white_part():
     share = white / (white + biased) * NOISE.stated_scale**2
     sizes = np.radians([1.0, 2.0, 4.0, 8.0, 16.0])[measured.objects]
     np.testing.assert_allclose(measured.covariances[:, 0, 0], share * sizes**2)
+
+
+@pytest.mark.parametrize("estimator", ["eskf", "graph", "batch"])
+def test_detections_that_call_themselves_exact_break_no_estimator(estimator):
+    log = simulate(
+        SimulationOptions(duration_s=4.0, imu_rate_hz=100.0, camera_rate_hz=10.0, objects=4, noise="network")
+    )
+    poses = log.object_poses[""]
+    exact = replace(poses, covariances=np.tile(1e-14 * np.eye(6), (len(poses), 1, 1)))
+    result = fuse(replace(log, object_poses={"": exact}), FuseOptions(estimator=estimator))
+    assert np.isfinite(result.trajectory.T_world_body.translation).all()

@@ -178,6 +178,20 @@ def test_a_wrong_given_pose_is_left_for_what_the_detections_say():
     assert off.max() < 0.05
 
 
+@pytest.mark.parametrize("tilt_deg", [90.0, 170.0])
+def test_a_filter_whose_attitude_is_far_off_gravity_starts_again(tilt_deg):
+    log = table([None] * 3, duration_s=8.0)
+    options = at_the_first_detection(log)
+    pose = options.start.pose
+    upset = Rotation.from_euler("x", tilt_deg, degrees=True) * Rotation.from_quat(pose[3:])
+    result = fuse(log, replace(options, start=replace(options.start, pose=(*pose[:3], *upset.as_quat()))))
+    estimate, _ = result.trajectory.interpolate(log.T_world_imu.stamps_ns[-50:])
+    truth = log.T_world_imu.T_world_body[-50:]
+    assert result.restarts >= 1
+    assert np.linalg.norm(estimate.translation - truth.translation, axis=1).max() < 0.1
+    assert np.degrees((estimate.rotation.inv() * truth.rotation).magnitude()).max() < 5.0
+
+
 @pytest.mark.parametrize("pose", [(0.0, 0.0, np.nan, 0.0, 0.0, 0.0, 1.0), (1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)])
 def test_a_given_pose_that_is_none_is_refused(pose):
     with pytest.raises(InputError, match=r"start\.pose"):
