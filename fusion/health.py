@@ -27,6 +27,9 @@ Mode = Literal["initialising", "tracking", "coasting", "lost"]
 MODES: tuple[Mode, ...] = ("initialising", "tracking", "coasting", "lost")
 Key = tuple[int, int]
 
+FEW_USED, LONG_LOST, LONG_MISSED_S = 2.0 / 3.0, 0.01, 1.0
+"""What `troubles` tells: a smaller share of poses used, a larger share of time lost, poses so long after the end, s."""
+
 
 @dataclass(frozen=True)
 class ObjectHealth:
@@ -154,6 +157,28 @@ def _runs(mask: NDArray[np.bool_], places: NDArray[np.int64]) -> list[tuple[int,
     edges = np.diff(np.r_[0, mask.astype(np.int8), 0])
     ends = np.flatnonzero(edges < 0) - 1
     return [(int(places[a]), int(places[b])) for a, b in zip(np.flatnonzero(edges > 0), ends)]
+
+
+def troubles(result: FuseResult) -> list[str]:
+    """Return what a user should know of a run that may have followed wrong poses or ended early; mostly nothing."""
+    found: list[str] = []
+    health = result.health
+    if health is None:
+        return found
+    moved = {key for key, _, _ in health.released}
+    met = [each for key, each in health.objects.items() if each.poses and key not in moved]
+    poses = sum(each.poses for each in met)
+    used = sum(each.poses * each.position_accepted for each in met) / max(poses, 1)
+    if poses and used < FEW_USED:
+        found.append(f"used {100.0 * used:.0f} % of the poses")
+    if health.restarts:
+        found.append(f"started again {health.restarts} times" if health.restarts > 1 else "started again once")
+    if health.share("lost") > LONG_LOST:
+        found.append(f"was lost for {100.0 * health.share('lost'):.0f} % of the time")
+    missed_s = float(result.gate.stamps_ns[-1] - result.stamps_ns[-1]) * 1e-9 if len(result.gate) else 0.0
+    if missed_s > LONG_MISSED_S:
+        found.append(f"ends {missed_s:.1f} s before the last pose, where its {result.motion} ends")
+    return found
 
 
 def as_plain(health: RunHealth) -> dict[str, Any]:

@@ -6,6 +6,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, fields, replace
 from typing import Literal
 
+from fusion.health import troubles
 from fusion.options import FuseOptions
 from fusion.result import FuseResult
 from landmarks.localize import LocalizeOptions, LocalizeResult, localize
@@ -107,6 +108,7 @@ def estimate_log(
         report.note(f"{log.path}: no imu.csv: fused on {fused[0].motion.replace('-', ' ')} instead")
     for result in fused:
         _tell_of_moved_objects(log, result, report)
+    _tell_of_troubles(log, fused, report)
     evaluation = evaluate_estimates(log, name, _estimates(log, localized, fused), options.evaluation, report)
     return Estimates(log, name, localized, fused, evaluation)
 
@@ -119,6 +121,15 @@ def _tell_of_moved_objects(log: Log, result: FuseResult, report: Report) -> None
     for key, first, last in result.health.released:
         span = f"left out from {(first - begin_ns) * 1e-9:.1f} s to {(last - begin_ns) * 1e-9:.1f} s"
         report.note(f"{log.path}: {names[key]} was moved: {span} ({result.name})")
+
+
+def _tell_of_troubles(log: Log, fused: Sequence[FuseResult], report: Report) -> None:
+    """Note what the first estimate with any trouble has, and how many others have some: they mostly share it."""
+    told = [(result.name, found) for result in fused if (found := troubles(result))]
+    if told:
+        others = f" ({len(told) - 1} other{'s' if len(told) > 2 else ''} likewise)" if len(told) > 1 else ""
+        what = " and ".join([", ".join(told[0][1][:-1]), told[0][1][-1]] if len(told[0][1]) > 1 else told[0][1])
+        report.note(f"{log.path}: {told[0][0]} {what}{others}; poet-loc check says what looks wrong in a log")
 
 
 def steps(modes: Sequence[Mode] = MODES, fusions: Sequence[Fusion] = FUSIONS) -> int:

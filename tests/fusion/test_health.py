@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import json
 import math
-from dataclasses import replace
+from dataclasses import fields, replace
 
 import numpy as np
 import pytest
 from test_online import estimator_for, events, feed
 
 from fusion.fuse import fuse, run_filter
-from fusion.health import as_plain, mode_of, run_health
+from fusion.health import as_plain, mode_of, run_health, troubles
 from fusion.options import FuseOptions, HealthOptions
 from fusion.prepare import pose_problem
 from fusion.simulate import SimulationOptions, simulate
@@ -106,3 +106,21 @@ def test_health_json_holds_plain_numbers(log):
     empty = fuse(without(log, 3.0, 100.0)).health
     unseen = replace(next(iter(empty.objects.values())), poses=0, test_ratio=math.nan)
     assert as_plain(replace(empty, objects={(1, 0): unseen}))["objects"][0]["test_ratio"] is None
+
+
+def test_troubles_are_told_where_there_are_some(log):
+    assert troubles(fuse(log)) == []
+    poses, imu = log.object_poses[""], log.imu
+    exact = replace(poses, covariances=np.tile(1e-6 * np.eye(6), (len(poses), 1, 1)))
+    result = fuse(replace(log, object_poses={"": exact}))
+    used = sum(each.poses * each.position_accepted for each in result.health.objects.values())
+    told = troubles(result)
+    assert (
+        told[0] == f"used {100 * used / sum(each.poses for each in result.health.objects.values()):.0f} % of the poses"
+    )
+    assert f"started again {result.restarts} times" in told
+    kept = imu.stamps_ns < imu.stamps_ns[0] + 6 * SECOND
+    short = replace(imu, **{each.name: getattr(imu, each.name)[kept] for each in fields(imu)})
+    (only,) = troubles(fuse(replace(log, imu=short)))
+    assert only.startswith("ends 3.9 s before the last pose")
+    assert only.endswith("where its imu ends")
