@@ -49,7 +49,7 @@ class BiasModel:
 
     def constant(self, kind: int) -> bool:
         """Tell whether a kind of bias stays as it is for ever."""
-        return bool(self.values[kind * object_biases.BIAS_MODEL_SIZE + object_biases.BIAS_TAU] == np.inf)
+        return bool(object_biases.is_steady.py_func(self.values, kind))
 
     def step(self, kind: int, mean: Array, seconds: float) -> tuple[Array, Array]:
         """Return factor and 1-sigma, each (6,), of what a bias does in some seconds (`object_biases.decay_biases`)."""

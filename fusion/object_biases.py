@@ -25,7 +25,7 @@ def decay_biases(m: Memory) -> None:
     seconds = (m.counters[NOW] - m.counters[BIAS_TIME]) * 1e-9
     m.counters[BIAS_TIME] = m.counters[NOW]
     for kind in range(m.layout[N_BIAS_KINDS]):
-        for k in range(m.layout[N_OBJECTS] if bias_phi(m.bias_model, kind, 0, seconds) < 1.0 else 0):
+        for k in range(0 if is_steady(m.bias_model, kind) else m.layout[N_OBJECTS]):
             for first in (0, 3):
                 _decay(m, k, kind, first, seconds)
 
@@ -84,6 +84,13 @@ def bias_sigma(bias_model: Array, kind: int, component: int) -> float:
 def bias_phi(bias_model: Array, kind: int, component: int, seconds: float) -> float:
     """Return what is left of such a component after some seconds, 1 where it never changes."""
     return math.exp(-seconds / bias_model[kind * BIAS_MODEL_SIZE + BIAS_TAU + _part(component)])
+
+
+@njit(cache=True)
+def is_steady(bias_model: Array, kind: int) -> bool:
+    """Tell whether no part of a kind of bias ever changes."""
+    at = kind * BIAS_MODEL_SIZE + BIAS_TAU
+    return bias_model[at] == math.inf and bias_model[at + 1] == math.inf and bias_model[at + 2] == math.inf
 
 
 @njit(cache=True)

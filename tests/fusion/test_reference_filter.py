@@ -43,6 +43,15 @@ def test_compiled_is_plain_through_an_imu_gap_and_with_noise_that_adapts():
     assert np.any(compiled.memory.scales > 1.0)
 
 
+def test_compiled_is_plain_where_one_part_of_a_bias_never_changes():
+    options = FuseOptions(bias=DetectionBias(correlation_rotation_s=np.inf, correlation_along_s=1.0))
+    problem = simulated(noise="network", options=options)
+    compiled, plain = (run(loop, problem, options) for loop in (filter_loop.run_log, reference_filter.run_log))
+    assert_same(compiled, plain)
+    other = replace(options, bias=DetectionBias(correlation_rotation_s=np.inf, correlation_along_s=9.0))
+    assert np.abs(run(filter_loop.run_log, problem, other).core[-1] - compiled.core[-1]).max() > 1e-6
+
+
 def test_compiled_is_plain_while_the_time_offset_is_followed():
     options = FuseOptions(bias=DetectionBias(use=False))
     problem = simulated(layout=LAYOUTS["time offset"], options=options, noise="white", stamp_delay_s=0.02)
