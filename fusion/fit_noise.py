@@ -106,16 +106,14 @@ def fit_noise(
     good = sum(len(stamps) for tracks in found.values() for stamps, _ in tracks)
     if good == 0:
         raise InputError(f"no object has {options.min_detections} good detections", fix="give longer logs")
-    shrunk = _shrinkage({key: np.array([errors.mean(axis=0) for _, errors in tracks]) for key, tracks in found.items()})
-    means = {}
-    for object_id, tracks in found.items():
-        each = np.array([errors.mean(axis=0) for _, errors in tracks])
+    averages = {key: np.array([errors.mean(axis=0) for _, errors in tracks]) for key, tracks in found.items()}
+    believed = _shrinkage(averages)
+    for key, tracks in found.items():
         for i, (stamps, errors) in enumerate(tracks):
-            others = np.delete(each, i, axis=0)
-            known = shrunk[object_id] * others.mean(axis=0) if len(others) else 0.0
+            others = np.delete(averages[key], i, axis=0)
+            known = believed[key] * others.mean(axis=0) if len(others) else 0.0
             _add_autocovariance(stamps, errors - known, sums, counts)
-        if len(tracks) > 1:
-            means[object_id] = shrunk[object_id] * each.mean(axis=0)
+    means = {key: believed[key] * each.mean(axis=0) for key, each in averages.items() if len(each) > 1}
     covariance = sums / np.maximum(counts, 1)
     usable = np.r_[True, counts[1:] > options.min_detections]
     parts = {name: _fit_part(covariance[part], lags, usable) for name, part in PARTS.items()}
