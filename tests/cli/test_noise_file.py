@@ -56,3 +56,8 @@ def test_a_table_of_fusions_takes_the_file(clean_log, tmp_path, capsys):
     assert rows[0] != rows[1]
     assert main([*words, "--noise-from", str(path)]) == 1
     assert "--noise-from changes nothing" in one_line(capsys)
+
+
+def test_a_log_named_twice_is_refused(clean_log, capsys):
+    assert main(["fit-noise", str(clean_log), str(clean_log / ".." / clean_log.name)]) == 1
+    assert "is named twice" in one_line(capsys)
