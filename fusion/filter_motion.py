@@ -14,13 +14,15 @@ from fusion.memory import (
     LAST_STAMP,
     MODE,
     NOW,
+    STARTED_AT,
     TRACKING,
     UP_COUNT,
+    VOTE_HEAD,
     Memory,
     Work,
 )
 from fusion.nav_state import AT_GRAVITY, GRAVITY, GYRO_BIAS, POSITION, Array, Ints
-from fusion.odometry import IS_ODOMETRY, move_by_odometry, spread_by_odometry
+from fusion.odometry import FAR_TURN, IS_ODOMETRY, ROTATION_DOUBT, move_by_odometry, spread_by_odometry
 from fusion.tape import note_odometry, note_step
 
 
@@ -31,7 +33,7 @@ def begin(m: Memory, stamp: int, specific_force: Array, imu_index: int) -> None:
     norm = math.sqrt(ax * ax + ay * ay + az * az)
     ux, uy, uz = (ax / norm, ay / norm, az / norm) if norm > 0.0 else (0.0, 0.0, 1.0)
     # Rows of R_world_imu: any x axis across up, then y, then up in imu axes.
-    hx, hy, hz = (0.0, uz, -uy) if abs(ux) > 0.9 else (1.0 - ux * ux, -ux * uy, -ux * uz)
+    hx, hy, hz = (-ux * uy, 1.0 - uy * uy, -uy * uz) if abs(ux) > 0.9 else (1.0 - ux * ux, -ux * uy, -ux * uz)
     scale = math.sqrt(hx * hx + hy * hy + hz * hz)
     hx, hy, hz = hx / scale, hy / scale, hz / scale
     rows = (hx, hy, hz, uy * hz - uz * hy, uz * hx - ux * hz, ux * hy - uy * hx, ux, uy, uz)
@@ -57,6 +59,8 @@ def advance(m: Memory, w: Work, imu_stamps: Ints, imu_values: Array, until: int)
         dt = (stop - c[NOW]) * 1e-9
         if m.noise[IS_ODOMETRY] > 0.0:
             _advance_by_odometry(m, w, dt, imu_values[k])
+            if stop == end and imu_values[k, ROTATION_DOUBT] * (end - start) * 1e-9 > FAR_TURN**2:
+                c[VOTE_HEAD], c[STARTED_AT] = 0, stop  # whatever was seen before says nothing of where this is
         elif c[MODE] == TRACKING:
             _advance_by_imu(m, w, dt, (end - start) * 1e-9, rate, force, imu_values[k + 1])
         else:
@@ -85,7 +89,7 @@ def _advance_by_odometry(m: Memory, w: Work, dt: float, twist: Array) -> None:
         R_before[i] = m.x[i]
     move_by_odometry(m.x, dt, twist[0:3], twist[3:6], w.step)
     if m.counters[MODE] == TRACKING:
-        spread_by_odometry(m.P, R_before, dt, m.noise, m.layout, w.step)
+        spread_by_odometry(m.P, R_before, dt, m.noise, twist, m.layout, w.step)
         if len(m.tape) > 0:
             note_odometry(m, w)
 

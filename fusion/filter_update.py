@@ -12,7 +12,7 @@ from fusion.eskf import ACCEPTED, POSITION_ONLY, REJECTED, ROTATION_ONLY, correc
 from fusion.measurements import OBJECT_POSE, object_in_world, residual_and_jacobian
 from fusion.meeting import UNKNOWN_MAP
 from fusion.memory import MODE, TRACKING, Memory, Work
-from fusion.nav_state import N_BIAS_KINDS, N_OBJECTS, OBJECT_SIZE, OBJECTS, TIME_OFFSET
+from fusion.nav_state import N_BIAS_KINDS, N_OBJECTS, OBJECT_SIZE, OBJECTS, TIME_OFFSET, Array
 from fusion.new_states import adopt_object
 from fusion.object_biases import forget_bias
 from fusion.place_watch import ON_MAP, RELEASED, TURNED, status_of
@@ -22,6 +22,7 @@ from fusion.tape import note_correction, note_forgetting, note_meeting
 LIMIT_BOTH, LIMIT_ROTATION, LIMIT_POSITION, PARTIAL, ADAPTATION, MAX_SCALE, JUMP_AFTER, SETTLED = range(8)
 
 GROSS = 10.0  # times the limit of the rotation's nis
+LINEAR = 0.35  # rad: a turn beyond it is left to votes that agree with each other (`starting.restart_if_lost`)
 
 
 @njit(cache=True)
@@ -35,7 +36,7 @@ def take(m: Memory, w: Work, log: Columns, j: int, correcting: bool) -> int:
     count = _predict(m, w, kind, k)
     innovation(m, w, count)
     decision, status = gate(w.S, w.residual, m.limits, m.limits[PARTIAL], w.L, w.white, nis), status_of(m, kind, k)
-    if decision == POSITION_ONLY and is_blunder(m, nis[1]):
+    if is_far(m, w.residual) or (decision == POSITION_ONLY and is_blunder(m, nis[1])):
         decision = REJECTED
     if not correcting:
         return decision
@@ -65,6 +66,13 @@ def is_blunder(m: Memory, nis_rotation: float) -> bool:
     """
     known = m.meeting[UNKNOWN_MAP] == 0.0
     return known and nis_rotation > GROSS * m.limits[LIMIT_ROTATION] and is_unsettled(m)
+
+
+@njit(cache=True)
+def is_far(m: Memory, residual: Array) -> bool:
+    """Tell whether a rotation is so far off, and the attitude so unsure, that what is linear there does not hold."""
+    unsure = m.P[0, 0] + m.P[1, 1] + m.P[2, 2] > LINEAR**2
+    return unsure and residual[0] ** 2 + residual[1] ** 2 + residual[2] ** 2 > LINEAR**2
 
 
 @njit(cache=True)

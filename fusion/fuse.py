@@ -15,7 +15,6 @@ from fusion.calibrated import calibrated
 from fusion.columns import OUT_CORE, OUT_COVARIANCE, OUT_SIGMA, Columns, Rows
 from fusion.eskf import POSITION_ONLY, ROTATION_ONLY
 from fusion.health import run_health
-from fusion.imu_noise import imu_rows
 from fusion.measurements import ODOMETRY_STEP, Measurements
 from fusion.options import FuseOptions
 from fusion.place_watch import RELEASED
@@ -94,7 +93,7 @@ def loop_columns(problem: Problem) -> tuple[Columns, Rows]:
     count, rows = len(measured), len(imu) + len(measured)
     columns = Columns(
         imu.stamps_ns,
-        imu_rows(imu),
+        problem.rows,
         measured.stamps_ns,
         measured.kinds,
         measured.objects,

@@ -10,8 +10,9 @@ from numpy.typing import NDArray
 
 from fusion.graph_model import MOTION_SIZE, SHIFT, TURN, imu_between, motion_between, move, rate_at
 from fusion.graph_variables import GRAVITY_KEY, imu_bias, imu_bias_key, pose_key, velocity_key
-from fusion.imu_noise import ACCEL_SQUARES, GYRO_SQUARES, density_squared, imu_rows
+from fusion.imu_noise import ACCEL_SQUARES, GYRO_SQUARES, density_squared
 from fusion.nav_state import ACCEL_BIAS, GRAVITY, GYRO_BIAS
+from fusion.odometry import ROTATION_DOUBT, ROTATION_WALK, TRANSLATION_DOUBT, TRANSLATION_WALK
 from fusion.options import FuseOptions
 from fusion.prepare import Problem, motion_noise
 from poet_loc.core.records import ImuNoise
@@ -31,7 +32,7 @@ class MotionChain:
 
     stamps_ns: Ints
     values: Array
-    """(N, 9) angular velocity and specific force, or odometry's twists, and their noise (`imu_noise.imu_rows`)."""
+    """(N, 9) angular velocity and specific force, or odometry's twists, and their noise (`prepare.Problem.rows`)."""
     noise: ImuNoise
     densities: Array
     """The filter's (`prepare.motion_noise`)."""
@@ -45,7 +46,7 @@ class MotionChain:
         """Return the chain of a problem."""
         imu, with_imu, gravity = problem.imu, problem.motion != "odometry", problem.layout.gravity
         noise = problem.imu_noise, motion_noise(problem, options)
-        return cls(imu.stamps_ns, imu_rows(imu), *noise, options, with_imu, gravity)
+        return cls(imu.stamps_ns, problem.rows, *noise, options, with_imu, gravity)
 
     def motion(self, start: int, end: int, x: Array) -> Array:
         """Return the motion (MOTION_SIZE,) between two stamps at the biases in a nominal array."""
@@ -65,7 +66,7 @@ class MotionChain:
         if not self.with_imu:
             motion = self.motion(start, end, x)
             move(predicted, motion)
-            return self._odometry_factor(k, motion, (end - start) * 1e-9), predicted
+            return self._odometry_factor(k, motion, start, end), predicted
         summed = self.preintegrate(start, end, imu_bias(x), x[GRAVITY : GRAVITY + 3])
         move(predicted, self.motion(start, end, x))
         keys = pose_key(k), velocity_key(k), pose_key(k + 1), velocity_key(k + 1), imu_bias_key(k), imu_bias_key(k + 1)
@@ -73,9 +74,12 @@ class MotionChain:
             return gtsam.CombinedImuFactorWithGravityVector(*keys, GRAVITY_KEY, summed), predicted
         return gtsam.CombinedImuFactor(*keys, summed), predicted
 
-    def _odometry_factor(self, k: int, motion: Array, seconds: float) -> gtsam.NonlinearFactor:
-        walk = self.options.odometry
-        sigma = np.repeat([np.radians(walk.rotation_walk_deg), walk.translation_walk], 3) * np.sqrt(seconds)
+    def _odometry_factor(self, k: int, motion: Array, start: int, end: int) -> gtsam.NonlinearFactor:
+        first, last = self.stamps_ns.searchsorted(start, side="right") - 1, self.stamps_ns.searchsorted(end)
+        seconds = np.diff(self.stamps_ns[first : last + 1].clip(start, end)) * 1e-9
+        doubts = self.values[first:last, ROTATION_DOUBT : TRANSLATION_DOUBT + 1]
+        walk = self.densities[[ROTATION_WALK, TRANSLATION_WALK]]
+        sigma = np.repeat(np.sqrt(seconds @ (walk**2 + doubts)), 3)
         measured = gtsam.Pose3(gtsam.Rot3(motion[TURN : TURN + 9].reshape(3, 3)), motion[SHIFT : SHIFT + 3])
         noise = gtsam.noiseModel.Diagonal.Sigmas(sigma)
         return gtsam.BetweenFactorPose3(pose_key(k), pose_key(k + 1), measured, noise)

@@ -17,8 +17,9 @@ from fusion.filter_loop import emit, end_of_stamp, measure
 from fusion.filter_motion import advance, begin, find_rate
 from fusion.fuse import loop_columns
 from fusion.measurements import ODOMETRY_STEP, residual_and_jacobian
-from fusion.memory import MODE, NOW, REPLACED, RESTARTS, TRACKING, Memory, Work, views, work_views
+from fusion.memory import IMU_AT, MODE, NOW, REPLACED, RESTARTS, TRACKING, Memory, Work, views, work_views
 from fusion.nav_state import AT_BIASES, N_BIAS_KINDS, N_OBJECTS, Array, Ints
+from fusion.odometry import IS_ODOMETRY, ROTATION_DOUBT, TRANSLATION_DOUBT
 from fusion.options import FuseOptions
 from fusion.prepare import Problem, fill_memory
 from fusion.so3_kernels import copy
@@ -67,7 +68,8 @@ def filter_until_keyframe(
     """Filter up to the next keyframe and return KEYFRAME, STARTED where the filter (re)started or put an object
     elsewhere there, or END.
 
-    A keyframe is due where `spacing` says so, where an object's bias jumped, and wherever odometry is measured. Its own
+    A keyframe is due where `spacing` says so, where an object's bias jumped, wherever odometry is measured, and where
+    it carries the state over what is not known (from a detection's keyframe to itself there is no noise). Its own
     measurements are taken in. fresh (2, kinds * objects * 2 halves) tells of each bias its variance where nothing ties
     it to the motion, else 0, and whether it has just been forgotten.
     """
@@ -111,7 +113,7 @@ def _go_to_measurements(
     cursor[JUMPED] = 1 if _find_fresh(m, fresh) else 0
     if not tracked or c[RESTARTS] + c[REPLACED] != restarts:
         return STARTED
-    due = cursor[JUMPED] == 1 or log.kinds[first] == ODOMETRY_STEP
+    due = cursor[JUMPED] == 1 or log.kinds[first] == ODOMETRY_STEP or _is_doubted(m, log)
     return KEYFRAME if due or c[NOW] - cursor[KEYFRAME_NS] >= spacing.every_ns else ON_THE_WAY
 
 
@@ -125,7 +127,16 @@ def _go_to_sample(m: Memory, w: Work, cursor: Ints, spacing: Spacing, log: Colum
         return ON_THE_WAY
     if cursor[ROWS] == 0 or rows.stamps[cursor[ROWS] - 1] != c[NOW]:
         _write_row(m, cursor, rows)
-    return KEYFRAME if c[NOW] - cursor[KEYFRAME_NS] >= spacing.idle_ns else ON_THE_WAY
+    return KEYFRAME if _is_doubted(m, log) or c[NOW] - cursor[KEYFRAME_NS] >= spacing.idle_ns else ON_THE_WAY
+
+
+@njit(cache=True)
+def _is_doubted(m: Memory, log: Columns) -> bool:
+    """Tell whether something of odometry's motion up to now is not known."""
+    k = m.counters[IMU_AT]
+    k -= 1 if k > 0 and m.counters[NOW] == log.imu_stamps[k] else 0
+    row = log.imu_values[k]
+    return m.noise[IS_ODOMETRY] > 0.0 and row[ROTATION_DOUBT] + row[TRANSLATION_DOUBT] > 0.0
 
 
 @njit(cache=True)

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import RigidTransform
 
 from fusion.measurements import BEFORE_POSES, ODOMETRY_STEP, Measurements
-from fusion.odometry import odometry_samples
+from fusion.odometry import believed_samples, odometry_samples
 from fusion.options import FuseOptions
 from poet_loc.core.input_error import InputError
 from poet_loc.core.records import Calibration, ImuNoise, ImuSamples
@@ -31,6 +31,8 @@ class MotionSource:
     noise: ImuNoise
     body: Literal["imu", "cam"]
     """Whose trajectory is estimated: the camera's where nothing says where an IMU would sit."""
+    doubts: NDArray[np.float64] | None = None
+    """odometry: what is not known of each sample (`odometry.believed_samples`)."""
 
 
 def motion_source(
@@ -48,10 +50,10 @@ def motion_source(
         return _imu(log, calibration, options)
     body: Literal["imu", "cam"] = "cam" if calibration.T_cam_imu is None else "imu"
     if kind == "odometry":
-        T_odom_cam = _odometry_of(log)
+        T_odom_cam = _held(_on_imu_clock(_odometry_of(log), calibration), stamps_ns, options.gap.longest_s)
         T_cam_body = RigidTransform.identity() if calibration.T_cam_imu is None else calibration.T_cam_imu
-        samples = odometry_samples(T_odom_cam, T_cam_body)
-        return MotionSource("odometry", samples, ImuNoise(0.0, 0.0, 0.0, 0.0, 0.0), body)
+        samples, doubts = believed_samples(odometry_samples(T_odom_cam, T_cam_body), options)
+        return MotionSource("odometry", samples, ImuNoise(0.0, 0.0, 0.0, 0.0, 0.0), body, doubts)
     return MotionSource("constant-velocity", _nothing_measured(stamps_ns, options), _smooth(options), body)
 
 
@@ -70,7 +72,7 @@ def odometry_steps(log: Log, calibration: Calibration, options: FuseOptions) -> 
 
     The first has nothing to be measured against and only says where the second begins.
     """
-    T_odom_cam, walk = _odometry_of(log), options.odometry
+    T_odom_cam, walk = _on_imu_clock(_odometry_of(log), calibration), options.odometry
     seconds, kept = (T_odom_cam.stamps_ns - T_odom_cam.stamps_ns[0]) * 1e-9, [0]
     for k, at in enumerate(seconds):
         if at - seconds[kept[-1]] >= walk.step_s - 1e-6:
@@ -78,7 +80,7 @@ def odometry_steps(log: Log, calibration: Calibration, options: FuseOptions) -> 
     poses, count = T_odom_cam.T_world_body[kept], len(kept)
     moved = RigidTransform.concatenate([RigidTransform.identity(), poses[:-1].inv() * poses[1:]])
     return Measurements(
-        T_odom_cam.stamps_ns[kept] + round(calibration.timeshift_cam_imu_s * 1e9),
+        T_odom_cam.stamps_ns[kept],
         np.full(count, ODOMETRY_STEP, dtype=np.int64),
         np.full(count, BEFORE_POSES, dtype=np.int64),
         moved.rotation.as_matrix().reshape(-1, 9),
@@ -97,6 +99,23 @@ def _odometry_of(log: Log) -> Trajectory:
     if log.T_odom_cam is None or len(log.T_odom_cam) < 2:
         raise InputError("the log has no T_odom_cam.tum", path=log.path, fix="choose another --motion")
     return log.T_odom_cam
+
+
+def _on_imu_clock(T_odom_cam: Trajectory, calibration: Calibration) -> Trajectory:
+    return replace(T_odom_cam, stamps_ns=T_odom_cam.stamps_ns + round(calibration.timeshift_cam_imu_s * 1e9))
+
+
+def _held(T_odom_cam: Trajectory, stamps_ns: NDArray[np.int64], longest_s: float) -> Trajectory:
+    """Return odometry that stands still from the first measurement and to the last, where it is silent there for long.
+
+    That it stood still nobody believes: to `odometry.believed_samples` it is a hole.
+    """
+    stamps, poses = T_odom_cam.stamps_ns, T_odom_cam.T_world_body
+    if len(stamps_ns) and stamps[0] - stamps_ns[0] > 1e9 * longest_s:
+        stamps, poses = np.r_[stamps_ns[0], stamps], RigidTransform.concatenate([poses[0], poses])
+    if len(stamps_ns) and stamps_ns[-1] - stamps[-1] > 1e9 * longest_s:
+        stamps, poses = np.r_[stamps, stamps_ns[-1]], RigidTransform.concatenate([poses, poses[-1]])
+    return Trajectory(stamps, poses)
 
 
 def _imu(log: Log, calibration: Calibration, options: FuseOptions) -> MotionSource:

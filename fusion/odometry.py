@@ -11,13 +11,21 @@ from scipy.spatial.transform import RigidTransform
 
 from fusion.compiled import njit
 from fusion.nav_state import N_ERROR, POSITION, POSITION_ERROR, VELOCITY, Array, Ints
+from fusion.options import FuseOptions
 from fusion.so3_kernels import apply, exp_so3, left_jacobian, multiply, orthonormalise, times_skew
 from poet_loc.core.geometry import local
+from poet_loc.core.odometry_breaks import Expected, believed_motion
 from poet_loc.core.records import ImuSamples
 from poet_loc.core.trajectory import Trajectory
 
 # Places in the noise array, behind those of the IMU.
 IS_ODOMETRY, ROTATION_WALK, TRANSLATION_WALK = 7, 8, 9
+
+# Places in a row of the samples, where an IMU's say how noisy it is: variances per second and axis of what is not known
+# of the motion until the next one (`believed_samples`).
+ROTATION_DOUBT, TRANSLATION_DOUBT = 6, 7
+
+FAR_TURN = 0.3  # rad, 1-sigma: a motion known no better than that may lead to where nothing is linear any more
 
 
 def odometry_samples(T_odom_cam: Trajectory, T_cam_body: RigidTransform) -> ImuSamples:
@@ -31,6 +39,23 @@ def odometry_samples(T_odom_cam: Trajectory, T_cam_body: RigidTransform) -> ImuS
     twist = local(T_odom_body[:-1], T_odom_body[1:]) / seconds
     twist = np.vstack([twist, twist[-1:]])
     return ImuSamples(T_odom_cam.stamps_ns, np.ascontiguousarray(twist[:, :3]), np.ascontiguousarray(twist[:, 3:]))
+
+
+def expected_of(options: FuseOptions) -> Expected:
+    """Return how odometry drifts, and what a camera may do in its holes, as the options say."""
+    walk, gap = options.odometry, options.gap
+    drift = float(np.radians(walk.rotation_walk_deg)), walk.translation_walk
+    return Expected(drift, gap.longest_s, (gap.angular_rate, gap.speed))
+
+
+def believed_samples(samples: ImuSamples, options: FuseOptions) -> tuple[ImuSamples, Array]:
+    """Return what to believe of `odometry_samples`, and the variances (N, 2) per second of what is not known of it."""
+    twists = np.hstack([samples.angular_velocity, samples.specific_force])
+    found = believed_motion(samples.stamps_ns, twists[:-1], expected_of(options))
+    doubts = found.sigmas**2 / (np.diff(samples.stamps_ns)[:, None] * 1e-9)
+    believed = np.vstack([found.twists, found.twists[-1:]])
+    kept = np.ascontiguousarray(believed[:, :3]), np.ascontiguousarray(believed[:, 3:])
+    return ImuSamples(samples.stamps_ns, *kept), np.vstack([doubts, doubts[-1:]])
 
 
 @njit(cache=True)
@@ -53,8 +78,13 @@ def move_by_odometry(x: Array, dt: float, rate: Array, velocity: Array, work: Ar
 
 
 @njit(cache=True)
-def spread_by_odometry(P: Array, R_before: Array, dt: float, noise: Array, layout: Ints, work: Array) -> None:
-    """P <- F P F^T + Q after `move_by_odometry`, in place: attitude turns with the body, position by the lever."""
+def spread_by_odometry(
+    P: Array, R_before: Array, dt: float, noise: Array, sample: Array, layout: Ints, work: Array
+) -> None:
+    """P <- F P F^T + Q after `move_by_odometry`, in place: attitude turns with the body, position by the lever.
+
+    sample (9,) is the row whose twist it was.
+    """
     n, lever, turn = layout[N_ERROR], work[36:45], work[0:9]
     times_skew(R_before, work[21], work[22], work[23], lever)
     for side in range(2):
@@ -70,5 +100,5 @@ def spread_by_odometry(P: Array, R_before: Array, dt: float, noise: Array, layou
                     P[j, POSITION_ERROR + i] -= shift
                     P[j, i] = turned
     for i in range(3):
-        P[i, i] += noise[ROTATION_WALK] ** 2 * dt
-        P[POSITION_ERROR + i, POSITION_ERROR + i] += noise[TRANSLATION_WALK] ** 2 * dt
+        P[i, i] += (noise[ROTATION_WALK] ** 2 + sample[ROTATION_DOUBT]) * dt
+        P[POSITION_ERROR + i, POSITION_ERROR + i] += (noise[TRANSLATION_WALK] ** 2 + sample[TRANSLATION_DOUBT]) * dt

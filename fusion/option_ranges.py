@@ -62,6 +62,7 @@ RANGES: dict[str, tuple[str, ...]] = {
         "imu.walk_scale",
         "gap.angular_rate",
         "gap.acceleration",
+        "gap.speed",
         "odometry.step_s",
         "graph.lag_s",
         "graph.relinearize",

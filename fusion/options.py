@@ -302,14 +302,16 @@ class ConstantVelocity:
 
 @dataclass(frozen=True)
 class Gap:
-    """How an interruption of the IMU is bridged."""
+    """How an interruption of the IMU or of odometry is bridged: what a camera may do that nobody sees."""
 
     longest_s: float = 0.1
-    """An interval longer than this is a gap, s."""
+    """An interval longer than this is a gap, s; of odometry one that is longer than three usual ones too."""
     angular_rate: float = 0.5
     """1-sigma of the angular rate inside a gap, rad/s."""
     acceleration: float = 2.0
-    """1-sigma of the acceleration inside a gap, m/s^2."""
+    """1-sigma of the acceleration inside a gap of the IMU, m/s^2."""
+    speed: float = 0.3
+    """1-sigma of the speed per axis inside a gap of odometry, m/s."""
 
 
 @dataclass(frozen=True)

@@ -14,6 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from fusion import ballot, filter_update, imu, meeting, memory, object_biases, odometry, place_watch
 from fusion.bias_spread import spread_model, white_part
+from fusion.imu_noise import imu_rows
 from fusion.known_errors import known_errors
 from fusion.measurements import CAMERA_POSE, OBJECT_POSE, Measurements, ray_aligned_covariance
 from fusion.motion_source import Kind, motion_source, odometry_steps
@@ -48,6 +49,16 @@ class Problem:
     landmark_map: LandmarkMap | None
     motion: Kind = "imu"
     body: Literal["imu", "cam"] = "imu"
+    doubts: Array | None = None
+    """odometry: what is not known of each sample (`odometry.believed_samples`)."""
+
+    @property
+    def rows(self) -> Array:
+        """Samples as the filter reads them (N, 9): `imu_noise.imu_rows`, or odometry's with its doubts."""
+        rows = imu_rows(self.imu)
+        if self.doubts is not None:
+            rows[:, odometry.ROTATION_DOUBT : odometry.TRANSLATION_DOUBT + 1] = self.doubts
+        return rows
 
     @property
     def keys(self) -> list[tuple[int, int]]:
@@ -82,7 +93,7 @@ def pose_problem(
     if source.kind not in WITH_IMU and options.estimate.gravity:
         raise InputError(f"{source.kind} feels no gravity", fix="do not estimate its direction")
     motion = (source.samples, source.noise, calibration, measured, layout, log.landmark_map, source.kind, source.body)
-    return Problem(log.path, *motion)
+    return Problem(log.path, *motion, source.doubts)
 
 
 def landmark_of_detection(poses: ObjectPoses, landmark_map: LandmarkMap) -> NDArray[np.int64]:

@@ -88,11 +88,15 @@ class ReferenceFilter:
             middle = 0.5 * ((now - imu_stamps[k]) + (stop - imu_stamps[k]))
             share = middle / (imu_stamps[k + 1] - imu_stamps[k])
             if m.noise[odometry.IS_ODOMETRY]:
-                self._step_by_odometry((stop - now) * 1e-9, imu_values[k, :6])
+                self._step_by_odometry((stop - now) * 1e-9, imu_values[k])
             else:
                 values = imu_values[k] + share * (imu_values[k + 1] - imu_values[k])
                 self._step((stop - now) * 1e-9, (imu_stamps[k + 1] - imu_stamps[k]) * 1e-9, values, imu_values[k + 1])
             c[memory.NOW] = stop
+            if stop == imu_stamps[k + 1] and m.noise[odometry.IS_ODOMETRY]:
+                turn = imu_values[k, odometry.ROTATION_DOUBT] * (imu_stamps[k + 1] - imu_stamps[k]) * 1e-9
+                if turn > odometry.FAR_TURN**2:
+                    c[memory.VOTE_HEAD], c[memory.STARTED_AT] = 0, stop
             c[memory.IMU_AT] += stop == imu_stamps[k + 1]
 
     def _step(self, dt: float, interval: float, values: Array, sample: Array) -> None:
@@ -106,11 +110,11 @@ class ReferenceFilter:
 
     def _step_by_odometry(self, dt: float, twist: Array) -> None:
         m = self.m
-        m.x[:], F = odometry_transition(m.x, dt, twist[:3], twist[3:], self.layout)
+        m.x[:], F = odometry_transition(m.x, dt, twist[:3], twist[3:6], self.layout)
         if self.tracking:
             Q = np.zeros_like(F)
-            Q[ATT, ATT] = m.noise[odometry.ROTATION_WALK] ** 2 * dt * np.eye(3)
-            Q[POS, POS] = m.noise[odometry.TRANSLATION_WALK] ** 2 * dt * np.eye(3)
+            Q[ATT, ATT] = (m.noise[odometry.ROTATION_WALK] ** 2 + twist[odometry.ROTATION_DOUBT]) * dt * np.eye(3)
+            Q[POS, POS] = (m.noise[odometry.TRANSLATION_WALK] ** 2 + twist[odometry.TRANSLATION_DOUBT]) * dt * np.eye(3)
             self.spread(F, Q)
 
     def spread(self, A: Array, Q: Array) -> None:
@@ -154,6 +158,8 @@ class ReferenceFilter:
         limits = self.m.limits
         for i, rows in enumerate((BOTH, ROTATION_ROWS, POSITION_ROWS)):
             nis[i] = residual[rows] @ np.linalg.solve(S[rows, rows], residual[rows])
+        if filter_update.is_far(self.m, residual):
+            return REJECTED
         if nis[0] <= limits[filter_update.LIMIT_BOTH]:
             return ACCEPTED
         if limits[filter_update.PARTIAL] >= 1 and nis[2] <= limits[filter_update.LIMIT_POSITION]:

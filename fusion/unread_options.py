@@ -73,9 +73,10 @@ RULES: tuple[Rule[Reader], ...] = (
     Rule("prior.extrinsic_*", "estimate.extrinsics", _asked(lambda o: o.estimate.extrinsics)),
     Rule("prior.time_offset", "estimate.time-offset", _asked(lambda o: o.estimate.time_offset)),
     Rule("prior.gravity_deg", "estimate.gravity", _asked(lambda o: o.estimate.gravity)),
-    Rule("imu.* gap.* prior.*_bias start.max_tilt_deg start.min_places", "an IMU", _motion(*WITH_IMU)),
+    Rule("imu.* gap.acc* prior.*_bias start.max_tilt_deg start.min_places", "an IMU", _motion(*WITH_IMU)),
+    Rule("gap.*", "an IMU or odometry", _motion(*WITH_IMU, "odometry")),
     Rule("prior.velocity", "another motion than odometry", _motion(*WITH_IMU, "constant-velocity")),
-    Rule("odometry.*", "odometry", _motion("odometry", "imu+odometry")),
+    Rule("odometry.* gap.speed", "odometry", _motion("odometry", "imu+odometry")),
     Rule("odometry.step_s", "odometry beside an IMU", _motion("imu+odometry")),
     Rule("constant_velocity.*", "the motion constant-velocity", _motion("constant-velocity")),
     Rule(

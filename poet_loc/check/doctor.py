@@ -16,6 +16,7 @@ from poet_loc.check.objects import (
     check_rotations_against_map,
     check_unknown_objects,
 )
+from poet_loc.check.odometry import check_odometry
 from poet_loc.check.reading import read_what_there_is
 from poet_loc.check.stamps import check_rate, check_spans, check_stamps
 from poet_loc.check.turns import check_turns
@@ -39,6 +40,7 @@ CHECKS: tuple[Check, ...] = (
     check_gravity,
     check_landmarks,
     check_noise,
+    check_odometry,
 )
 """In this order: each sees the log as the repairs of those before it leave it."""
 

@@ -7,6 +7,7 @@ from dataclasses import dataclass, field, fields, replace
 from typing import Literal
 
 from fusion.health import troubles
+from fusion.odometry import expected_of
 from fusion.options import FuseOptions
 from fusion.result import FuseResult
 from landmarks.localize import LocalizeOptions, LocalizeResult, localize
@@ -14,6 +15,7 @@ from landmarks.options import MODES, ORACLES, Mode, SolverOptions
 from poet_loc.check.units import check_accelerometer, check_gyroscope
 from poet_loc.cli.terminal import Report
 from poet_loc.core.input_error import InputError
+from poet_loc.core.odometry_breaks import odometry_breaks
 from poet_loc.core.records import CameraPoses
 from poet_loc.io.log_folder import Log
 from poet_loc.report.evaluate import Estimate, EvaluateOptions, Evaluation
@@ -33,6 +35,7 @@ Fusion = Literal[
 ]
 """<estimator>/<measurements>, as in the name of the estimate."""
 
+_TOLD_BREAKS = 3
 _REFUSED = ("accelerometer-unit", "no-gravity", "gyroscope-degrees")  # where certain
 
 FUSIONS: tuple[Fusion, ...] = ("eskf/objects", "eskf/camera", "graph/objects")
@@ -109,6 +112,7 @@ def estimate_log(
     for result in fused:
         _tell_of_moved_objects(log, result, report)
     _tell_of_troubles(log, fused, report)
+    _tell_of_odometry(log, fused, options.fusion, report)
     evaluation = evaluate_estimates(log, name, _estimates(log, localized, fused), options.evaluation, report)
     return Estimates(log, name, localized, fused, evaluation)
 
@@ -130,6 +134,17 @@ def _tell_of_troubles(log: Log, fused: Sequence[FuseResult], report: Report) -> 
         others = f" ({len(told) - 1} other{'s' if len(told) > 2 else ''} likewise)" if len(told) > 1 else ""
         what = " and ".join([", ".join(told[0][1][:-1]), told[0][1][-1]] if len(told[0][1]) > 1 else told[0][1])
         report.note(f"{log.path}: {told[0][0]} {what}{others}; poet-loc check says what looks wrong in a log")
+
+
+def _tell_of_odometry(log: Log, fused: Sequence[FuseResult], options: FuseOptions, report: Report) -> None:
+    """Note where the odometry that was used jumps or has holes."""
+    if log.T_odom_cam is None or not any("odometry" in result.motion for result in fused):
+        return
+    breaks, begin_ns = odometry_breaks(log.T_odom_cam, expected_of(options)), int(log.T_odom_cam.stamps_ns[0])
+    told = ", ".join(f"{each.text} at {(each.after_ns - begin_ns) * 1e-9:.1f} s" for each in breaks[:_TOLD_BREAKS])
+    if breaks:
+        more = f" and {len(breaks) - _TOLD_BREAKS} more" if len(breaks) > _TOLD_BREAKS else ""
+        report.note(f"{log.path}: T_odom_cam.tum has {told}{more}: not taken for motion")
 
 
 def steps(modes: Sequence[Mode] = MODES, fusions: Sequence[Fusion] = FUSIONS) -> int:

@@ -60,6 +60,19 @@ def detection_gap(log: Log) -> Log:
     return replace(log, object_poses={"": poses[(seconds < 2.0) | (seconds > 11.0)]})
 
 
+def broken_odometry(length_s: float, jump_m: float) -> SpoilLog:
+    """Add odometry that is the truth but for a hole, or a jump."""
+
+    def spoil(log: Log) -> Log:
+        truth, jump = log.T_world_cam, make_pose(Rotation.identity(), np.array([0.0, jump_m, 0.0]))
+        seconds, poses = (truth.stamps_ns - truth.stamps_ns[0]) / 1e9, truth.T_world_body
+        before, after = np.flatnonzero(seconds < 3.0), np.flatnonzero(seconds >= 3.0 + length_s)
+        poses = RigidTransform.concatenate([poses[before], jump * poses[after]])
+        return replace(log, T_odom_cam=Trajectory(truth.stamps_ns[np.r_[before, after]], poses))
+
+    return spoil
+
+
 def receive_times(log: Log) -> Log:
     rng = np.random.default_rng(1)
     stamps = np.sort(log.imu.stamps_ns + rng.uniform(-6e6, 6e6, len(log.imu)).astype(np.int64))
@@ -273,6 +286,8 @@ SPOILED_LOGS: dict[str, tuple[SpoilLog, set[str], bool]] = {
     "world with y up": (world_on_its_side, {"gravity-tilted"}, False),
     "gap in the imu": (imu_gap, {"gap"}, False),
     "nothing detected for long": (detection_gap, {"gap"}, False),
+    "odometry that jumps": (broken_odometry(0.0, 0.4), {"odometry-jump"}, False),
+    "odometry with a hole": (broken_odometry(1.5, 0.0), {"odometry-hole"}, False),
     "stamps of receipt": (receive_times, {"jitter"}, False),
     "stamps in microseconds": (microseconds, {"stamp-unit"}, True),
     "imu on another clock": (other_clock, {"span"}, False),

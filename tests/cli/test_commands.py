@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import shutil
 import subprocess
 import sys
@@ -369,6 +370,22 @@ def test_one_estimator_is_refused_where_several_run(command, clean_log, tmp_path
     paths = {"LOG": str(clean_log), "RUN": str(tmp_path / "run")}
     assert main([*(paths.get(word, word) for word in command), "--fusion.estimator", "graph"]) == 1
     assert "--fusions" in capsys.readouterr().err
+
+
+def test_fuse_names_where_the_odometry_jumps(tmp_path, capsys):
+    log, out = tmp_path / "log", tmp_path / "run"
+    world = ["--odometry", "--duration-s", "8", "--objects", "4", "--symmetric-objects", "0", "--noise", "white"]
+    assert main(["simulate", "--out", str(log), *world]) == 0
+    lines = (log / "T_odom_cam.tum").read_text().splitlines()
+    half = len(lines) // 2
+    begin, at = (float(next(line for line in part if line[0] != "#").split()[0]) for part in (lines, lines[half - 1 :]))
+    cells = [line.split() for line in lines[half:]]
+    moved = [" ".join([c[0], repr(float(c[1]) + 0.4), *c[2:]]) for c in cells]
+    (log / "T_odom_cam.tum").write_text("\n".join([*lines[:half], *moved]) + "\n")
+    capsys.readouterr()
+    assert main(["fuse", str(log), "--out", str(out), "--motion", "odometry", "--no-pictures"]) == 0
+    told = " ".join(capsys.readouterr().err.split())
+    assert re.search(rf"T_odom_cam.tum has a jump of 0\.(39|40) m and 0 deg at {at - begin:.1f} s: not taken for", told)
 
 
 def test_fuse_names_an_object_that_was_moved_and_takes_odometry_beside_the_imu(tmp_path, capsys):

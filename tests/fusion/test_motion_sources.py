@@ -70,7 +70,7 @@ def test_odometry_spreads_covariance_by_its_derivative():
     P = A @ A.T
     spread = P.copy()
     moved(x)
-    odometry.spread_by_odometry(spread, x[:9].copy(), dt, np.zeros(12), layout.as_integers(), work)
+    odometry.spread_by_odometry(spread, x[:9].copy(), dt, np.zeros(12), np.zeros(9), layout.as_integers(), work)
     np.testing.assert_allclose(spread, F @ P @ F.T, atol=1e-6 * np.abs(P).max())
 
 
