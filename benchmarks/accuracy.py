@@ -72,7 +72,10 @@ def fitted(asked: argparse.Namespace) -> None:
             file = str(Path(folder) / f"{name}.yaml")
             command("fit-noise", *training, "--detections", name, "--out", file)
             from_it = ("--detections", name, "--modes", "best", "--noise-from", file)
-            table_of(asked, TEST_LOGS, *from_it, "--fusions", "eskf/objects", "graph/objects")
+            for motion in ("imu+odometry", "odometry"):
+                table_of(
+                    asked, TEST_LOGS, *from_it, "--fusions", "eskf/objects", "graph/objects", "--fusion.motion", motion
+                )
 
 
 def euroc(asked: argparse.Namespace) -> None:

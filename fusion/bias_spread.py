@@ -19,6 +19,7 @@ from fusion.measurements import OBJECT_POSE, viewing_axes
 from fusion.memory import Memory
 from fusion.nav_state import N_BIAS_KINDS, SPREAD_COUNT, SPREAD_SIZE, SPREADS
 from fusion.options import DetectionBias, DetectionNoise
+from fusion.scatter import is_usual_known, spread_by_scatter
 
 Array = NDArray[np.float64]
 
@@ -65,10 +66,14 @@ def _share(white: float, varying: float, steady: float, squared: Array, floor: f
 def follow_spreads(m: Memory, log: Columns, first: int, last: int) -> None:
     """Take the white noise of detections first..last-1 into their objects' factors in the nominal array.
 
-    These are geometric means over an object's last detections, so that a moment's doubt is no moment's bias.
+    These are geometric means over an object's last detections, so that a moment's doubt is no moment's bias. Where the
+    usual scatter of detections is known, an object's own (`scatter.py`) takes their place.
     """
+    by_scatter = is_usual_known(m)
     for j in range(first, last if m.layout[N_BIAS_KINDS] > 0 else first):
-        if log.kinds[j] == OBJECT_POSE:
+        if log.kinds[j] == OBJECT_POSE and by_scatter:
+            spread_by_scatter(m, log.objects[j])
+        elif log.kinds[j] == OBJECT_POSE:
             _follow_spread(m, log.objects[j], log.covariances[j], log.translations[j])
 
 

@@ -34,6 +34,7 @@ class Fitted(NamedTuple):
 
     rotations: Array  # (M, 9)
     covariances: Array  # (M, 6, 6)
+    spreads: Array  # (M, 3) of its object's biases
     weights: Array  # (M,) at the state that knows the measurement
 
 

@@ -16,6 +16,7 @@ from fusion.nav_state import N_BIAS_KINDS, N_OBJECTS, OBJECT_SIZE, OBJECTS, TIME
 from fusion.new_states import adopt_object
 from fusion.object_biases import forget_bias
 from fusion.place_watch import ON_MAP, RELEASED, TURNED, status_of
+from fusion.scatter import follow_scatter
 from fusion.tape import note_correction, note_forgetting, note_meeting
 
 # Places in the limits.
@@ -34,6 +35,8 @@ def take(m: Memory, w: Work, log: Columns, j: int, correcting: bool) -> int:
         return REJECTED
     read_fitted(m, w, log, j)
     count = _predict(m, w, kind, k)
+    if kind == OBJECT_POSE:
+        follow_scatter(m, k, log.translations[j], w.residual)
     innovation(m, w, count)
     decision, status = gate(w.S, w.residual, m.limits, m.limits[PARTIAL], w.L, w.white, nis), status_of(m, kind, k)
     if is_far(m, w.residual) or (decision == POSITION_ONLY and is_blunder(m, nis[1])):

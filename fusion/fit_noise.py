@@ -7,6 +7,7 @@ noise, the varying and the steady bias. Gross errors are left out and counted: t
 What an object's errors have in common from log to log is its mean error, which a filter can take off beforehand; it
 is shrunk towards zero by what the scatter between logs leaves uncertain of it (random effects, variances by the method
 of moments). The three parts are then those of what the other logs' mean error leaves of each: what a new log brings.
+How much detections scatter from one to the next says by how much an object's own biases differ (`fusion/scatter.py`).
 """
 
 from __future__ import annotations
@@ -21,6 +22,7 @@ from scipy.optimize import least_squares
 
 from fusion.options import DetectionBias, DetectionNoise
 from fusion.prepare import NEAREST_OBJECT, landmark_of_detection
+from fusion.scatter import scatter_of
 from poet_loc.core.input_error import InputError, within
 from poet_loc.core.records import ObjectPoses
 from poet_loc.io.log_folder import Log
@@ -70,6 +72,8 @@ class FittedNoise:
     """Share of the detections that are gross errors."""
     detections: int
     """How many the fit stands on."""
+    scatter: Array
+    """How much an object's detections usually scatter: 1-sigma (3,) of rotation (rad), across, along (`scatter.py`)."""
     means: dict[int, Array] = field(default_factory=dict)
     """By object id, of objects in two logs or more: the mean error (6,) that a new log will have too."""
 
@@ -87,6 +91,9 @@ class FittedNoise:
             steady_across=across.steady,
             steady_along=along.steady,
             steady_rotation_deg=math.degrees(rotation.steady),
+            scatter_rotation_deg=math.degrees(self.scatter[0]),
+            scatter_across=float(self.scatter[1]),
+            scatter_along=float(self.scatter[2]),
             means=tuple(_row_of_means(object_id, mean) for object_id, mean in sorted(self.means.items())),
         )
         return noise, bias
@@ -102,7 +109,7 @@ def fit_noise(
     options = options or FitNoiseOptions()
     lags = (np.arange(1, max(2, round(options.longest_lag_s / _STEP_S))) * _STEP_S).astype(np.float64)
     sums, counts = np.zeros((6, len(lags) + 1)), np.zeros(len(lags) + 1)
-    found, seen = _good_errors(logs, detections, options)
+    found, seen, scatters = _good_errors(logs, detections, options)
     good = sum(len(stamps) for tracks in found.values() for stamps, _ in tracks)
     if good == 0:
         raise InputError(f"no object has {options.min_detections} good detections", fix="give longer logs")
@@ -117,7 +124,7 @@ def fit_noise(
     covariance = sums / np.maximum(counts, 1)
     usable = np.r_[True, counts[1:] > options.min_detections]
     parts = {name: _fit_part(covariance[part], lags, usable) for name, part in PARTS.items()}
-    return FittedNoise(parts, 1.0 - good / seen, good, means)
+    return FittedNoise(parts, 1.0 - good / seen, good, _usual_scatter(scatters), means)
 
 
 def _row_of_means(object_id: int, mean: Array) -> tuple[int, float, float, float, float, float, float]:
@@ -127,17 +134,26 @@ def _row_of_means(object_id: int, mean: Array) -> tuple[int, float, float, float
 
 def _good_errors(
     logs: Iterable[Log], detections: str | None, options: FitNoiseOptions
-) -> tuple[dict[int, list[Track]], int]:
-    """Return by object id what is no gross error, log by log, and how many detections there are in all."""
+) -> tuple[dict[int, list[Track]], int, list[Array]]:
+    """Return by object id what is no gross error, log by log, how many detections there are, and how they scatter."""
     found: dict[int, list[Track]] = {}
-    seen = 0
+    seen, scatters = 0, []
     for log in logs:
-        for object_id, stamps, errors in _object_errors(log, log.detections(detections)[1]):
+        poses = log.detections(detections)[1]
+        for object_id, stamps, errors in _object_errors(log, poses):
             keep = _is_good(errors, options)
             seen += len(keep)
             if np.count_nonzero(keep) >= options.min_detections:
                 found.setdefault(object_id, []).append((stamps[keep], errors[keep]))
-    return found, seen
+                if poses.covariances is None:  # else what they state sizes their biases
+                    scatters.append(scatter_of(stamps, errors))
+    return found, seen, scatters
+
+
+def _usual_scatter(scatters: list[Array]) -> Array:
+    """Return the geometric mean over objects and logs, zeros (not known) where no detections follow closely."""
+    known = [each for each in scatters if np.isfinite(each).all()]
+    return np.exp(np.mean(np.log(known), axis=0)) if known else np.zeros(3)
 
 
 def _shrinkage(means: dict[int, Array]) -> dict[int, Array]:

@@ -34,6 +34,8 @@ from fusion.nav_state import (
     GYRO_BIAS,
     N_BIAS_KINDS,
     N_OBJECTS,
+    SPREAD_SIZE,
+    SPREADS,
     VELOCITY,
     Array,
     Ints,
@@ -79,6 +81,9 @@ def linearise(
             motion = motion_between(log.imu_stamps, log.imu_values, keyframe_ns, stamp, biases, odometry)
             rate = rate_at(log.imu_stamps, log.imu_values, stamp, biases[0:3])
         copy(here, x)
+        if kind == OBJECT_POSE and layout[N_BIAS_KINDS] > 0:
+            at = layout[SPREADS] + SPREAD_SIZE * k
+            copy(fitted.spreads[i], x[at : at + 3])
         seen = kind, k, above, below - above, fitted.rotations[i], log.translations[i]
         e, J = error_and_jacobian(*seen, rate, motion, x, layout)
         if kind == OBJECT_POSE:

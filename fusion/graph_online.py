@@ -82,7 +82,7 @@ class GraphEstimator(Estimator):
         poses = int(seconds * self.online.max_pose_rate_hz)
         samples = int(seconds * self.online.max_imu_rate_hz)
         self._room, self._walk.out = loop_columns(_room_for(self._problem, samples, poses))
-        self._fitted = Fitted(np.zeros((poses, 9)), np.zeros((poses, 6, 6)), np.zeros(poses))
+        self._fitted = Fitted(np.zeros((poses, 9)), np.zeros((poses, 6, 6)), np.ones((poses, 3)), np.zeros(poses))
         self._samples = self._poses = 0
         self._rate, self._force = np.zeros(3), np.zeros(3)
         self._chain = MotionChain.of(self._problem, self.options)

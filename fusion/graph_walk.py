@@ -16,9 +16,9 @@ from fusion.eskf import ACCEPTED, POSITION_ONLY, ROTATION_ONLY, cholesky, whiten
 from fusion.filter_loop import emit, end_of_stamp, measure
 from fusion.filter_motion import advance, begin, find_rate
 from fusion.fuse import loop_columns
-from fusion.measurements import ODOMETRY_STEP, residual_and_jacobian
+from fusion.measurements import OBJECT_POSE, ODOMETRY_STEP, residual_and_jacobian
 from fusion.memory import IMU_AT, MODE, NOW, REPLACED, RESTARTS, TRACKING, Memory, Work, views, work_views
-from fusion.nav_state import AT_BIASES, N_BIAS_KINDS, N_OBJECTS, Array, Ints
+from fusion.nav_state import AT_BIASES, N_BIAS_KINDS, N_OBJECTS, SPREAD_SIZE, SPREADS, Array, Ints
 from fusion.odometry import IS_ODOMETRY, ROTATION_DOUBT, TRANSLATION_DOUBT
 from fusion.options import FuseOptions
 from fusion.prepare import Problem, fill_memory
@@ -109,6 +109,9 @@ def _go_to_measurements(
         read_fitted(m, w, log, i)
         copy(w.measured, fitted.rotations[i])
         copy(w.R.reshape(36), fitted.covariances[i].reshape(36))
+        if log.kinds[i] == OBJECT_POSE and m.layout[N_BIAS_KINDS] > 0:
+            at = m.layout[SPREADS] + SPREAD_SIZE * log.objects[i]
+            copy(m.x[at : at + 3], fitted.spreads[i])
         fitted.weights[i] = _weight(m, w, log, i, spacing.kernel, spacing.width)
     cursor[JUMPED] = 1 if _find_fresh(m, fresh) else 0
     if not tracked or c[RESTARTS] + c[REPLACED] != restarts:
@@ -225,7 +228,7 @@ class Walk:
         self.memory = memory.views.py_func(self.floats, self.integers)
         self.columns, self.out = loop_columns(problem)
         count = len(problem.measurements)
-        self.fitted = Fitted(np.zeros((count, 9)), np.zeros((count, 6, 6)), np.ones(count))
+        self.fitted = Fitted(np.zeros((count, 9)), np.zeros((count, 6, 6)), np.ones((count, 3)), np.ones(count))
         self.cursor = np.zeros(CURSOR_SIZE, dtype=np.int64)
         self.begun, self.first = False, 0
         self.fresh = np.zeros((2, 2 * max(1, problem.layout.n_objects * problem.layout.bias_kinds)))

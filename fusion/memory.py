@@ -42,6 +42,7 @@ VOTES = 256  # a second of eight objects at 30 Hz; a power of two, so that place
 INITIALISING, TRACKING = 0, 1
 
 TALLY_SIZE, PLACE_SIZE = 8, 15  # rows of tallies and places, see place_watch.py
+SCATTER_SIZE = 11  # see scatter.py
 SUPPOSED, SUPPOSED_SIZE = 6, 16  # hypotheses of each unknown object's pose, see meeting.py
 
 # Integer header: where things stand in the float buffer, sizes.
@@ -54,6 +55,7 @@ SUPPOSED, SUPPOSED_SIZE = 6, 16  # hypotheses of each unknown object's pose, see
     AT_TALLIES,
     AT_PLACES,
     AT_SUPPOSED,
+    AT_SCATTER,
     AT_UP,
     END_OF_STATE,
     AT_NOISE,
@@ -61,6 +63,7 @@ SUPPOSED, SUPPOSED_SIZE = 6, 16  # hypotheses of each unknown object's pose, see
     AT_START,
     AT_BIAS_MODEL,
     AT_SPREAD_MODEL,
+    AT_USUAL_SCATTER,
     AT_MOVED,
     AT_MEETING,
     AT_AXES,
@@ -81,7 +84,7 @@ SUPPOSED, SUPPOSED_SIZE = 6, 16  # hypotheses of each unknown object's pose, see
     AT_TAPE,
     TAPE_SIZE,
     HEADER,
-) = range(35)
+) = range(37)
 
 
 class Memory(NamedTuple):
@@ -95,12 +98,14 @@ class Memory(NamedTuple):
     tallies: Array  # (K + 1, .) how the measurements of each object, and camera poses, fared: places in place_watch.py
     places: Array  # (K, .) where each object stands against the map: places in place_watch.py
     supposed: Array  # (K, SUPPOSED, .) where an object of unknown pose may be: places in meeting.py; or (0, ..)
+    scatter: Array  # (K, .) how much each object's detections differ from one to the next: places in scatter.py
     up: Array  # (3,) running mean of the specific force in the axes of the integrated motion
     noise: Array  # of the motion: places in imu.py and odometry.py
     limits: Array  # places: filter_update.LIMIT_BOTH and following
     start: Array
     bias_model: Array
     spread_model: Array  # of detections that state no noise: places in bias_spread.py
+    usual_scatter: Array  # (3,) of such detections, 0 where it is not known (`scatter.usual_scatter`)
     moved: Array  # when an object counts as moved: places in place_watch.py
     meeting: Array  # when an object of unknown pose is put where it is seen: places in meeting.py
     axes: Array  # (K, 3) symmetry axes
@@ -131,6 +136,7 @@ def allocate(layout: StateLayout) -> tuple[Array, Ints]:
         (AT_TALLIES, TALLY_SIZE * (max(K, 1) + 1)),
         (AT_PLACES, PLACE_SIZE * max(K, 1)),
         (AT_SUPPOSED, SUPPOSED * SUPPOSED_SIZE * header[H_SUPPOSED]),
+        (AT_SCATTER, SCATTER_SIZE * max(K, 1)),
         (AT_UP, 3),
         (END_OF_STATE, 0),
         (AT_NOISE, 12),
@@ -138,6 +144,7 @@ def allocate(layout: StateLayout) -> tuple[Array, Ints]:
         (AT_START, 32),
         (AT_BIAS_MODEL, 16),
         (AT_SPREAD_MODEL, 5),
+        (AT_USUAL_SCATTER, 3),
         (AT_MOVED, 12),
         (AT_MEETING, 8),
         (AT_AXES, 3 * max(K, 1)),
@@ -192,13 +199,15 @@ def views(floats: Array, integers: Ints) -> Memory:
         f[i[AT_KNOWN] : i[AT_KNOWN] + K],
         f[i[AT_TALLIES] : i[AT_TALLIES] + TALLY_SIZE * (K + 1)].reshape((K + 1, TALLY_SIZE)),
         f[i[AT_PLACES] : i[AT_PLACES] + PLACE_SIZE * K].reshape((K, PLACE_SIZE)),
-        f[i[AT_SUPPOSED] : i[AT_UP]].reshape((i[H_SUPPOSED], SUPPOSED, SUPPOSED_SIZE)),
+        f[i[AT_SUPPOSED] : i[AT_SCATTER]].reshape((i[H_SUPPOSED], SUPPOSED, SUPPOSED_SIZE)),
+        f[i[AT_SCATTER] : i[AT_SCATTER] + SCATTER_SIZE * K].reshape((K, SCATTER_SIZE)),
         f[i[AT_UP] : i[AT_UP] + 3],
         f[i[AT_NOISE] : i[AT_NOISE] + 12],
         f[i[AT_LIMITS] : i[AT_LIMITS] + 12],
         f[i[AT_START] : i[AT_START] + 32],
         f[i[AT_BIAS_MODEL] : i[AT_BIAS_MODEL] + 16],
         f[i[AT_SPREAD_MODEL] : i[AT_SPREAD_MODEL] + 5],
+        f[i[AT_USUAL_SCATTER] : i[AT_USUAL_SCATTER] + 3],
         f[i[AT_MOVED] : i[AT_MOVED] + 12],
         f[i[AT_MEETING] : i[AT_MEETING] + 8],
         f[i[AT_AXES] : i[AT_AXES] + 3 * K].reshape((K, 3)),

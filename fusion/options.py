@@ -74,6 +74,13 @@ class DetectionBias:
     """What is known of the steady one, and taken off the detections: for each object its id and the mean error of its
     rotation x y z, deg in camera axes, and of its place across the ray x y and along it, shares of the distance.
     `fit-noise` finds it from two logs or more; the steady 1-sigma is then of what is left."""
+    scatter_rotation_deg: float = 0.0
+    """How much the rotations of an object's detections usually scatter from one to the next, 1-sigma per axis, deg. An
+    object whose own scatter four times as much is given biases twice as large (`fit-noise` finds it); 0: not known."""
+    scatter_across: float = 0.0
+    """The same of places across the ray, as a share of the distance,"""
+    scatter_along: float = 0.0
+    """and along it."""
     jump_after: int = 20
     """An object refused so often in a row has another bias: the old one is forgotten."""
     jump: float = 5.0

@@ -53,6 +53,7 @@ from fusion.reference_models import (
     transport,
 )
 from fusion.result import FuseResult
+from fusion.scatter import follow_scatter
 from poet_loc.core.geometry import make_pose
 
 
@@ -181,6 +182,8 @@ class ReferenceFilter:
                 R_m, R = self._fit_symmetry(k, R_m, R)
         rate, offset = self.work.rate, self.work.offset[0]
         residual, H = residual_and_jacobian(kind, k, R_m, t_m, m.x, rate, offset, self.layout)
+        if kind == OBJECT_POSE:
+            follow_scatter(m, k, t_m, residual)
         decision, status = self.gate(residual, H @ m.P @ H.T + R, nis), status_of(m, kind, k)
         if not correcting:
             return decision

@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated
 
+import numpy as np
 import tyro
 
 from fusion.fit_noise import FitNoiseOptions, FittedNoise, fit_noise
@@ -61,6 +62,9 @@ def _lines(fitted: FittedNoise) -> list[str]:
         unit, scale = units[name]
         sizes = (scale * part.white, scale * part.varying, part.correlation_s, scale * part.steady)
         lines.append(f"{name + ', ' + unit:<22}{sizes[0]:9.3f}{sizes[1]:9.3f}{sizes[2]:6.1f} s{sizes[3]:9.3f}")
+    if fitted.scatter.any():
+        turned, across, along = np.array([180.0 / math.pi, 100.0, 100.0]) * fitted.scatter
+        lines.append(f"usual scatter from one detection to the next: {turned:.3f} deg, {across:.3f} and {along:.3f} %")
     means = fitted.options()[1].means
     if means:
         lines.append(f"{'mean error of object':<22}{'rotation x y z, deg':>27}{'across x y, along, %':>29}")

@@ -6,13 +6,17 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.spatial.transform import RigidTransform, Rotation
 
 from fusion import memory
+from fusion.detection_errors import gauss_markov
 from fusion.fuse import loop_columns
+from fusion.measurements import ray_aligned_covariance, viewing_axes
 from fusion.nav_state import StateLayout
 from fusion.options import FuseOptions
 from fusion.prepare import Problem, fill_memory, pose_problem
 from fusion.simulate import SimulationOptions, simulate
+from poet_loc.io.log_folder import Log
 
 LAYOUTS = {
     "no biases": StateLayout(n_objects=3),
@@ -79,3 +83,23 @@ def assert_same(one: FilterRun, other: FilterRun, tolerance: float = 1e-9) -> No
     np.testing.assert_array_equal(one.memory.counters, other.memory.counters)
     for part in ("tallies", "places", "known"):
         np.testing.assert_allclose(getattr(one.memory, part), getattr(other.memory, part), rtol=1e-7, atol=1e-9)
+
+
+def differing(seed: int, stated: bool) -> Log:
+    """Return a log whose objects' rotations err by 1 to 16 deg, biased, with or without covariances that say so."""
+    log = simulate(SimulationOptions(seed=seed, objects=5, symmetric_objects=0, noise="none", duration_s=15.0))
+    poses, rng = log.object_poses[""], np.random.default_rng(seed)
+    frames, frame = np.unique(poses.stamps_ns, return_inverse=True)
+    sizes = np.radians([1.0, 2.0, 4.0, 8.0, 16.0])[poses.object_ids - 1]
+    slow = np.sqrt(0.4) * gauss_markov(len(frames), (5, 6), 1.0 / 30.0 / 3.0, rng)
+    slow += np.sqrt(0.4) * rng.standard_normal((1, 5, 6))
+    errors = slow[frame, poses.object_ids - 1] + np.sqrt(0.2) * rng.standard_normal((len(poses), 6))
+    t = poses.T_cam_obj.translation
+    axes, far = viewing_axes(t), np.linalg.norm(t, axis=1)[:, None]
+    shift = np.einsum("nij,nj->ni", axes, far * [0.004, 0.004, 0.025] * errors[:, 3:])
+    turn = Rotation.from_rotvec(sizes[:, None] * errors[:, :3])
+    covariances = ray_aligned_covariance(t, 0.004, 0.025, 1.0)
+    covariances[:, :3, :3] *= sizes[:, None, None] ** 2
+    T_cam_obj = RigidTransform.from_components(t + shift, turn * poses.T_cam_obj.rotation)
+    poses = replace(poses, T_cam_obj=T_cam_obj, covariances=covariances if stated else None)
+    return replace(log, object_poses={"": poses})

@@ -6,15 +6,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from filter_runs import assert_same, run
+from filter_runs import assert_same, differing, run
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from scipy.spatial.transform import RigidTransform, Rotation
 
 from fusion import filter_loop, memory, reference_filter
 from fusion.bias_spread import follow_spreads, spread_model, white_part
 from fusion.columns import Columns
-from fusion.detection_errors import gauss_markov
 from fusion.fuse import fuse
 from fusion.measurements import OBJECT_POSE, ray_aligned_covariance, viewing_axes
 from fusion.nav_state import StateLayout, nominal_state
@@ -22,7 +20,6 @@ from fusion.options import DetectionBias, DetectionNoise, FuseOptions
 from fusion.prepare import object_measurements, pose_problem
 from fusion.simulate import SimulationOptions, simulate
 from poet_loc.core.consistency import pose_nees
-from poet_loc.io.log_folder import Log
 
 NOISE, BIAS, LAYOUT = DetectionNoise(), DetectionBias(), StateLayout(n_objects=2, bias_kinds=2)
 SIGMAS = st.floats(1e-3, 0.5)
@@ -80,26 +77,6 @@ def test_without_biases_all_that_is_stated_is_white():
     scale = NOISE.stated_scale
     white = white_part(stated, np.array([[0.0, 0.0, 1.0]]), NOISE, replace(BIAS, use=False))
     np.testing.assert_allclose(white, scale**2 * stated)
-
-
-def differing(seed: int, stated: bool) -> Log:
-    """Return a log whose objects' rotations err by 1 to 16 deg, biased, with or without covariances that say so."""
-    log = simulate(SimulationOptions(seed=seed, objects=5, symmetric_objects=0, noise="none", duration_s=15.0))
-    poses, rng = log.object_poses[""], np.random.default_rng(seed)
-    frames, frame = np.unique(poses.stamps_ns, return_inverse=True)
-    sizes = np.radians([1.0, 2.0, 4.0, 8.0, 16.0])[poses.object_ids - 1]
-    slow = np.sqrt(0.4) * gauss_markov(len(frames), (5, 6), 1.0 / 30.0 / 3.0, rng)
-    slow += np.sqrt(0.4) * rng.standard_normal((1, 5, 6))
-    errors = slow[frame, poses.object_ids - 1] + np.sqrt(0.2) * rng.standard_normal((len(poses), 6))
-    t = poses.T_cam_obj.translation
-    axes, far = viewing_axes(t), np.linalg.norm(t, axis=1)[:, None]
-    shift = np.einsum("nij,nj->ni", axes, far * [0.004, 0.004, 0.025] * errors[:, 3:])
-    turn = Rotation.from_rotvec(sizes[:, None] * errors[:, :3])
-    covariances = ray_aligned_covariance(t, 0.004, 0.025, 1.0)
-    covariances[:, :3, :3] *= sizes[:, None, None] ** 2
-    T_cam_obj = RigidTransform.from_components(t + shift, turn * poses.T_cam_obj.rotation)
-    poses = replace(poses, T_cam_obj=T_cam_obj, covariances=covariances if stated else None)
-    return replace(log, object_poses={"": poses})
 
 
 def test_an_object_that_says_how_unsure_it_is_counts_for_as_much():

@@ -74,6 +74,7 @@ def assert_ends_like(estimator: Estimator, problem: Problem, options: FuseOption
     np.testing.assert_allclose(estimator.memory.tallies, whole.memory.tallies, rtol=1e-7)
     np.testing.assert_allclose(estimator.memory.places, whole.memory.places, rtol=1e-7, atol=1e-9)
     np.testing.assert_array_equal(estimator.memory.used, whole.memory.used)
+    np.testing.assert_allclose(estimator.memory.scatter, whole.memory.scatter, rtol=1e-7)
 
 
 def shuffled(problem: Problem, lateness_s: float, rng: np.random.Generator) -> list[tuple[int, int, int]]:
@@ -116,6 +117,17 @@ def test_shuffled_input_gives_the_in_order_result(layout, seed):
     health = estimator.health()
     assert health.too_late == 0
     assert health.replays > 50
+
+
+def test_shuffled_input_gives_the_in_order_result_where_scatter_sizes_the_biases():
+    options = FuseOptions(bias=DetectionBias(scatter_rotation_deg=1.0, scatter_across=0.002, scatter_along=0.01))
+    problem = simulated(noise="network", options=options)
+    estimator = estimator_for(problem, options, OnlineOptions(horizon_s=0.4))
+    for event in shuffled(problem, 0.4, np.random.default_rng(5)):
+        feed(estimator, problem, event)
+    assert_ends_like(estimator, problem, options)
+    assert np.ptp(estimator.memory.x[problem.layout.spread_start :].reshape(-1, 4)[:, :3], axis=0).min() > 0.0
+    assert estimator.health().replays > 50
 
 
 @pytest.mark.parametrize("delay_s", [-0.03, 0.03])
