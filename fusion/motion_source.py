@@ -13,6 +13,7 @@ from fusion.measurements import BEFORE_POSES, ODOMETRY_STEP, Measurements
 from fusion.odometry import believed_samples, odometry_samples
 from fusion.options import FuseOptions
 from poet_loc.core.input_error import InputError
+from poet_loc.core.odometry_breaks import holes_between
 from poet_loc.core.records import Calibration, ImuNoise, ImuSamples
 from poet_loc.core.trajectory import Trajectory
 from poet_loc.io.log_folder import Log
@@ -106,14 +107,14 @@ def _on_imu_clock(T_odom_cam: Trajectory, calibration: Calibration) -> Trajector
 
 
 def _held(T_odom_cam: Trajectory, stamps_ns: NDArray[np.int64], longest_s: float) -> Trajectory:
-    """Return odometry that stands still from the first measurement and to the last, where it is silent there for long.
+    """Return odometry that stands still from the first measurement and to the last, where that is a hole.
 
-    That it stood still nobody believes: to `odometry.believed_samples` it is a hole.
+    That it stood still nobody believes (`odometry.believed_samples`).
     """
     stamps, poses = T_odom_cam.stamps_ns, T_odom_cam.T_world_body
     if len(stamps_ns) and stamps[0] - stamps_ns[0] > 1e9 * longest_s:
         stamps, poses = np.r_[stamps_ns[0], stamps], RigidTransform.concatenate([poses[0], poses])
-    if len(stamps_ns) and stamps_ns[-1] - stamps[-1] > 1e9 * longest_s:
+    if len(stamps_ns) and holes_between(np.r_[stamps, max(stamps_ns[-1], stamps[-1])], longest_s)[-1] > 0.0:
         stamps, poses = np.r_[stamps, stamps_ns[-1]], RigidTransform.concatenate([poses, poses[-1]])
     return Trajectory(stamps, poses)
 

@@ -312,7 +312,7 @@ class Gap:
     """How an interruption of the IMU or of odometry is bridged: what a camera may do that nobody sees."""
 
     longest_s: float = 0.1
-    """An interval longer than this is a gap, s; of odometry one that is longer than three usual ones too."""
+    """An interval longer than this is a gap, s; of odometry it is longer than three times what most are too."""
     angular_rate: float = 0.5
     """1-sigma of the angular rate inside a gap, rad/s."""
     acceleration: float = 2.0

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import median_filter
+from scipy.ndimage import percentile_filter
 
 from poet_loc.core.geometry import local
 from poet_loc.core.trajectory import Trajectory
@@ -19,10 +19,10 @@ Array = NDArray[np.float64]
 
 FAR = 5.0
 """A twist is off where it differs so many times more from the one before than they mostly do."""
-_LONG = 3.0  # times the usual interval make a hole
+_LONG, _MOSTLY = 3.0, 90.0  # times the interval that so many in a hundred keep within make a hole
 _REMEMBERED = 31  # intervals that say what is usual, odd
 _TOLD, _TOLD_S = (np.radians(5.0), 0.05), 0.5  # rad and m of a jump, s of a hole, that are worth telling
-_CORRELATED_S = 1.0  # for so long a motion that is not known goes one way; then it wanders
+_CORRELATED_S = 1.0  # for so long a motion goes one way; then it wanders
 
 
 @dataclass(frozen=True)
@@ -32,9 +32,9 @@ class Expected:
     walk: tuple[float, float]
     """1-sigma of its drift, rad and m per square root of a second and axis."""
     longest_s: float
-    """An interval longer than this, and than three usual ones, is a hole, s."""
+    """An interval longer than this, and than three times what most are, is a hole, s."""
     unseen: tuple[float, float]
-    """1-sigma of the rates inside a hole, rad/s and m/s per axis."""
+    """1-sigma of the rates inside a hole, rad/s and m/s per axis; by as much they may change in a second."""
 
 
 @dataclass(frozen=True)
@@ -58,27 +58,35 @@ def believed_motion(stamps_ns: NDArray[np.int64], twists: Array, expected: Expec
     camera may do unseen; what it is off beyond that is taken off, and is a 1-sigma of what is not known.
     """
     seconds = np.diff(stamps_ns) * 1e-9
-    usual = np.r_[0.0, _running_median(seconds)[1:]]  # of one alone it is not known
-    holes = np.maximum(0.0, seconds - np.maximum(expected.longest_s, _LONG * usual))
+    holes = holes_between(stamps_ns, expected.longest_s)
     believed, sigmas, taken_off = twists.copy(), np.empty((len(twists), 2)), np.zeros((len(twists), 2))
     for part in range(2):
         own = believed[:, 3 * part : 3 * part + 3]
         unseen = expected.unseen[part] * np.sqrt(holes * np.minimum(holes, _CORRELATED_S))
         loose = unseen / seconds
         differences = np.linalg.norm(np.diff(own, axis=0, prepend=own[:1]), axis=1)
-        drift = np.sqrt(6.0 / seconds) * expected.walk[part]  # of the difference of two twists
-        limits = FAR * np.maximum(_running_median(differences), drift) + loose + np.r_[0.0, loose[:-1]]
+        moved = expected.unseen[part] * np.minimum(seconds - holes, _CORRELATED_S)
+        least = np.hypot(np.sqrt(6.0 / seconds) * expected.walk[part], moved)  # drift of both, and a change of motion
+        usual = np.maximum(_running_percentile(differences, 50.0), least)
+        limits = FAR * usual + loose + np.r_[0.0, loose[:-1]]
         taken_off[:, part] = _hold(own, limits, differences > limits) * seconds
         sigmas[:, part] = np.hypot(unseen, taken_off[:, part])
     return Believed(believed, sigmas, taken_off, holes)
 
 
-def _running_median(values: Array) -> Array:
-    """Return the median of each value and those before it."""
-    found = np.asarray(median_filter(values, _REMEMBERED, mode="nearest", origin=_REMEMBERED // 2))
+def holes_between(stamps_ns: NDArray[np.int64], longest_s: float) -> Array:
+    """Return how much longer than usual each of the N intervals between N + 1 stamps is, s; mostly 0."""
+    seconds = np.diff(stamps_ns) * 1e-9
+    usual = np.r_[0.0, _running_percentile(seconds, _MOSTLY)[1:]]  # of one alone it is not known
+    return np.maximum(0.0, seconds - np.maximum(longest_s, _LONG * usual))
+
+
+def _running_percentile(values: Array, percentile: float) -> Array:
+    """Return the percentile of each value and those before it, as far back as is remembered."""
+    found = percentile_filter(values, percentile, _REMEMBERED, mode="nearest", origin=_REMEMBERED // 2)
     for k in range(min(len(values), _REMEMBERED)):
-        found[k] = np.median(values[: k + 1])
-    return found
+        found[k] = np.percentile(values[: k + 1], percentile)
+    return np.asarray(found)
 
 
 def _hold(twists: Array, limits: Array, off: NDArray[np.bool_]) -> Array:

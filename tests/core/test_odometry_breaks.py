@@ -8,6 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import RigidTransform
 
+from poet_loc.core.geometry import local
 from poet_loc.core.odometry_breaks import FAR, Expected, believed_motion, odometry_breaks
 from poet_loc.core.trajectory import Trajectory
 from poet_loc.io.tum import read_tum
@@ -88,6 +89,22 @@ def test_a_hole_is_an_interval_much_longer_than_the_others(rate_hz):
     assert believed.holes_s[40] == pytest.approx(unseen_s)
     np.testing.assert_allclose(believed.sigmas[40], np.array([0.5, 0.3]) * np.sqrt(unseen_s))
     assert not believed.sigmas[41:].any()
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_sparse_and_uneven_odometry_is_believed(seed):
+    """Keyframes: intervals of very different lengths, over which the motion changes much, from rest on."""
+    rng, poses = np.random.default_rng(seed), [RigidTransform.identity()]
+    for k, twist in enumerate(hand_held(seed, 1800)):
+        moved = twist / RATE_HZ if k > 200 else np.zeros(6)
+        poses.append(poses[-1] * RigidTransform.from_exp_coords(moved))
+    kept = np.cumsum(rng.integers(2, 16, size=180))
+    kept = kept[kept < len(poses)]
+    stamps, T = np.round(kept * 1e9 / RATE_HZ).astype(np.int64), RigidTransform.concatenate(poses)[kept]
+    twists = local(T[:-1], T[1:]) / (np.diff(stamps)[:, None] * 1e-9)
+    believed = believed_motion(stamps, twists, EXPECTED)
+    np.testing.assert_array_equal(believed.twists, twists)
+    assert not believed.holes_s[10:].any()
 
 
 def test_breaks_are_named_with_stamp_and_size():
