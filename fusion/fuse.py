@@ -12,6 +12,7 @@ from scipy.spatial.transform import RigidTransform
 
 from fusion import filter_loop, memory
 from fusion.calibrated import calibrated
+from fusion.coarse_offset import with_coarse_offset
 from fusion.columns import OUT_CORE, OUT_COVARIANCE, OUT_SIGMA, Columns, Rows
 from fusion.eskf import POSITION_ONLY, ROTATION_ONLY
 from fusion.health import run_health
@@ -35,10 +36,12 @@ def fuse(
 ) -> FuseResult:
     """Fuse a log's camera or object poses with its IMU.
 
-    camera_poses stand in for the log's own camera_poses.csv, object_poses for the only detections of the log.
+    camera_poses stand in for the log's own camera_poses.csv, object_poses for the only detections of the log. Where the
+    time offset is estimated, it begins at what the log's turn rates say if these contradict the calibration.
     Raises InputError where the log lacks what the options need, or where the start's conditions are never met.
     """
     options = options or FuseOptions()
+    log = with_coarse_offset(log, options, camera_poses, object_poses)
     problem = pose_problem(log, options, camera_poses, object_poses)
     result = _estimate(problem, options)
     return replace(result, health=run_health(result, options, int(problem.imu.stamps_ns[0])))

@@ -262,7 +262,8 @@ class Estimate:
     extrinsics: bool = False
     """Where the camera sits on the IMU."""
     time_offset: bool = False
-    """The camera's time offset against the IMU, beside the calibration's."""
+    """The camera's time offset against the IMU, beside the calibration's; a whole log begins at what its turn rates say
+    where they contradict the calibration, online begins at the calibration's."""
     gravity: bool = False
     """The direction of gravity in the world."""
     map: Literal["known", "approximate", "unknown"] = "known"

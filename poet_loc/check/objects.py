@@ -16,7 +16,7 @@ from landmarks.landmark_map import map_arrays
 from landmarks.options import SolverOptions
 from poet_loc.check.finding import Evidence, Finding
 from poet_loc.check.gravity import solved
-from poet_loc.check.turn_rates import READINGS, Reading, reread
+from poet_loc.check.pose_sources import READINGS, Reading, reread
 from poet_loc.core.records import LandmarkMap, ObjectPoses
 from poet_loc.core.trajectory import Trajectory
 from poet_loc.io.log_folder import Log, object_poses_file

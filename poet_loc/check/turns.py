@@ -10,20 +10,10 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from poet_loc.check.finding import Evidence, Finding
-from poet_loc.check.turn_rates import (
-    READINGS,
-    Match,
-    PoseSource,
-    Reading,
-    advantage,
-    correlation_under,
-    match_turns,
-    pose_sources,
-    reread,
-    turn_rates,
-)
+from poet_loc.check.pose_sources import READINGS, PoseSource, Reading, pose_sources, reread
 from poet_loc.core.records import Calibration, ImuSamples
 from poet_loc.core.trajectory import Trajectory
+from poet_loc.core.turn_match import Match, correlation_under, match_turns
 from poet_loc.io.log_folder import Log, object_poses_file
 
 Direction = Literal["as is", "inverse"]
@@ -35,8 +25,6 @@ _DEGREES = 180.0 / np.pi
 _UNIT_MARGIN = 3.0  # on real detections the scale is off by less than 2
 _FAINT, _ABOVE_CHANCE = 0.2, 0.1  # correlation from which a source tells that much
 _LEAST_IMU = 50  # samples
-_OFFSET_FLOOR_S, _OFFSET_NOISE_S = 0.005, 0.07
-_OFFSET_CLEAR, _OFFSET_ADVANTAGE = 0.8, 1.5  # below this correlation, by so many standard errors above the expected
 
 
 @dataclass(frozen=True)
@@ -47,6 +35,8 @@ class _Compared:
     match: Match
     """Of the file as it is, or with its rotations the other way round where that fits far better."""
     as_it_is: Match | None
+    telling: bool
+    """It turns enough like the gyroscope to judge by; a time offset may stand out all the same."""
     fits: dict[tuple[Reading, Direction], float]
 
     def best_of(self, direction: Direction) -> float:
@@ -87,11 +77,11 @@ def gyroscope_beside_poses(log: Log) -> Turning | None:
         return None
     found = []
     for source in pose_sources(log):
-        rates = turn_rates(source)
+        rates = source.turn_rates()
         for factor in (1.0, _DEGREES):
             imu = replace(log.imu, angular_velocity=log.imu.angular_velocity / factor)
             match = match_turns(imu, rates)
-            if match is not None and match.correlation > max(_FAINT, match.background + _ABOVE_CHANCE):
+            if match is not None and match.correlation > max(_FAINT, match.offset.background + _ABOVE_CHANCE):
                 found.append(Turning(match.gyroscope_scale * factor, match.correlation, source.file))
     return max(found, key=lambda each: each.correlation, default=None)
 
@@ -103,8 +93,10 @@ def check_turns(log: Log) -> Iterator[Finding]:
     R_cam_imu = None
     if log.calibration is not None and log.calibration.T_cam_imu is not None:
         R_cam_imu = log.calibration.T_cam_imu.rotation
-    compared = [each for source in pose_sources(log) if (each := _compare(log.imu, source, R_cam_imu))]
+    every = [each for source in pose_sources(log) if (each := _compare(log.imu, source, R_cam_imu))]
+    compared = [each for each in every if each.telling]
     if not compared:
+        yield from _offsets(log, every)
         return
     mirrored = list(_axes(compared))
     yield from mirrored
@@ -119,7 +111,7 @@ def check_turns(log: Log) -> Iterator[Finding]:
     if not inverted and R_cam_imu is not None:
         misread = {finding.file for finding in misread_findings}
         yield from _rotation_off([each for each in compared if each.source.file not in misread], R_cam_imu)
-    yield from _offsets(log, compared)
+    yield from _offsets(log, every)
 
 
 def _fits_better(fit: float, than: float) -> bool:
@@ -127,13 +119,16 @@ def _fits_better(fit: float, than: float) -> bool:
 
 
 def _compare(imu: ImuSamples, source: PoseSource, R_cam_imu: Rotation | None) -> _Compared | None:
-    rates = {reading: turn_rates(source, reading) for reading in READINGS}
+    rates = {reading: source.turn_rates(reading) for reading in READINGS}
     as_it_is = match = match_turns(imu, rates["as is"])
     if match is None or match.correlation < _CLEAN:  # a wrong order of the quaternion turns like an inverse
         other = match_turns(imu, rates["inverse"])
         if other is not None and (match is None or other.correlation > match.correlation + 0.01):
             match = other
-    if match is None or match.correlation < _TELLING or match.correlation < match.background + 0.1:
+    if match is None:
+        return None
+    telling = match.correlation >= max(_TELLING, match.offset.background + 0.1)
+    if not telling and not match.offset.distinct:
         return None
     ways: dict[Direction, Rotation] = {}
     if source.body == "imu":
@@ -141,11 +136,11 @@ def _compare(imu: ImuSamples, source: PoseSource, R_cam_imu: Rotation | None) ->
     elif R_cam_imu is not None:
         ways = {"as is": R_cam_imu.inv(), "inverse": R_cam_imu}
     fits = {
-        (reading, way): correlation_under(imu, rates[reading], match.offset_s, rotation)
+        (reading, way): correlation_under(imu, rates[reading], match.offset.offset_s, rotation)
         for reading in READINGS
         for way, rotation in ways.items()
     }
-    return _Compared(source, match, as_it_is, fits)
+    return _Compared(source, match, as_it_is, telling, fits)
 
 
 def _axes(compared: list[_Compared]) -> Iterator[Finding]:
@@ -224,7 +219,7 @@ def _readings(compared: list[_Compared], direction: Direction) -> Iterator[Findi
             yield Finding("quaternion-order", "error", each.source.file, what, fix, evidence, repair)
         else:
             what = "the poses are the other direction, it seems: only inverted they turn as the gyroscope does"
-            name = "T_cam_obj" if each.source.of_object else f"T_world_{each.source.body}"
+            name = "T_cam_obj" if each.source.stream.of_object else f"T_world_{each.source.body}"
             yield Finding("poses-inverted", "error", each.source.file, what, f"write {name}", evidence, repair)
 
 
@@ -256,16 +251,10 @@ def _offsets(log: Log, compared: list[_Compared]) -> Iterator[Finding]:
     late = []
     for each in compared:
         expected = stated if each.source.body == "cam" else 0.0
-        off = each.match.offset_s - expected
-        correlation = min(each.match.correlation, 1.0)
-        uncertain = _OFFSET_FLOOR_S + _OFFSET_NOISE_S * np.sqrt(1.0 - correlation**2) / correlation
-        clear = abs(off) > uncertain and (
-            correlation > _OFFSET_CLEAR or _advantage(log, each, expected) > _OFFSET_ADVANTAGE
-        )
-        late.append((each, off, off if clear else 0.0))
+        late.append((each, each.match.offset.offset_s - expected, each.match.contradicts(expected)))
     of_camera = [(each, off) for each, off, wrong in late if each.source.body == "cam" and wrong]
     cameras = [each for each, _, _ in late if each.source.body == "cam"]
-    offsets = [each.match.offset_s for each, _ in of_camera]
+    offsets = [each.match.offset.offset_s for each, _ in of_camera]
     agree = bool(offsets) and len(of_camera) == len(cameras) and float(np.ptp(offsets)) < 0.03
     for each, off, wrong in late:
         if not wrong:
@@ -277,20 +266,14 @@ def _offsets(log: Log, compared: list[_Compared]) -> Iterator[Finding]:
         yield _offset_finding(each, off, stated, shared and log.calibration is not None)
 
 
-def _advantage(log: Log, each: _Compared, expected_s: float) -> float:
-    """By how many standard errors the source fits better at the offset found than at the expected one."""
-    assert log.imu is not None
-    reading: Reading = "as is" if each.match is each.as_it_is else "inverse"
-    return advantage(log.imu, turn_rates(each.source, reading), each.match.offset_s, expected_s)
-
-
 def _offset_finding(each: _Compared, off: float, stated: float, shared: bool) -> Finding:
-    measured = each.match.offset_s
+    measured = each.match.offset.offset_s
     evidence: Evidence = {
         "measured_t_imu_minus_t_pose_s": round(measured, 4),
         "expected_s": stated if each.source.body == "cam" else 0.0,
+        "sigma_s": round(each.match.offset.sigma_s, 4),
         "correlation": each.match.correlation,
-        "correlation_far_away": each.match.background,
+        "correlation_far_away": each.match.offset.background,
     }
     way = "late" if off < 0 else "early"
     what = (

@@ -215,7 +215,10 @@ def _fused(
     wanted = any(choice.measurements == "camera" for choice in choices)
     from_solver = _solved(log, detections, localized, options.solver, attempt) if wanted else None
     object_poses = None if detections is None else log.object_poses[detections]
-    refused = _refused_units(log, detections, attempt.report) if any(map(_takes_imu, choices)) else None
+    with_imu = any(map(_takes_imu, choices))
+    refused = _refused_units(log, detections, attempt.report) if with_imu else None
+    if with_imu and refused is None:
+        _tell_of_time_offset(log, detections, options.fusion, attempt.report)
     there = {"objects": object_poses is not None, "camera": log.camera_poses is not None or from_solver is not None}
     for fusion, choice in zip(fusions, choices, strict=True):
         if not there[choice.measurements] and not attempt.strict:
@@ -246,6 +249,20 @@ def _refused_units(log: Log, detections: str | None, report: Report) -> InputErr
         if finding.check.startswith("gyroscope"):
             report.note(f"{log.path / finding.file}: {finding.what}; {finding.fix}")
     return None
+
+
+def _tell_of_time_offset(log: Log, detections: str | None, options: FuseOptions, report: Report) -> None:
+    """Note where the poses turn with the gyroscope at another time offset than the calibration's."""
+    from fusion.coarse_offset import coarse_offset
+
+    stated = 0.0 if log.calibration is None else log.calibration.timeshift_cam_imu_s
+    match = coarse_offset(log, object_poses=None if detections is None else log.object_poses[detections])
+    if match is None or not match.contradicts(stated):
+        return
+    found = f"{match.offset.offset_s:.3f} +- {match.offset.sigma_s:.3f} s"
+    what = f"the poses turn as the gyroscope does at timeshift_cam_imu: {found}, not at {stated:g} s"
+    fix = "put it into calibration.yaml, or see --estimate.time-offset"
+    report.note(f"{log.path}: {what}; {'the estimate begins there' if options.estimate.time_offset else fix}")
 
 
 def _solved(

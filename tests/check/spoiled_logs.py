@@ -10,7 +10,7 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from poet_loc.check.gravity import turned_world
-from poet_loc.check.turn_rates import Reading, reread
+from poet_loc.check.pose_sources import Reading, reread
 from poet_loc.core.geometry import make_pose
 from poet_loc.core.records import LandmarkMap
 from poet_loc.core.trajectory import Trajectory

@@ -87,6 +87,19 @@ def test_the_time_offset_has_kalibrs_sign(tmp_path) -> None:
     assert finding.evidence["measured_t_imu_minus_t_pose_s"] == pytest.approx(0.06, abs=0.005)
 
 
+@pytest.mark.parametrize("late_s", [-0.5, 0.7])
+def test_a_time_offset_is_told_of_detections_that_turn_little_like_the_gyroscope(late_s, shared_data, tmp_path) -> None:
+    log = read_log(shared_data / "ycbv_dope" / "0055")
+    poses = log.object_poses["supervised"]
+    poses = replace(poses, stamps_ns=poses.stamps_ns + round(late_s * 1e9))
+    alone = replace(log, object_poses={"": poses}, T_odom_cam=None, T_world_cam=None, T_world_imu=None, frames=None)
+    write_log(tmp_path, alone)
+    (finding,) = diagnose(tmp_path).findings
+    assert finding.check == "time-offset"
+    assert finding.evidence["measured_t_imu_minus_t_pose_s"] == pytest.approx(-late_s, abs=0.03)
+    assert "set timeshift_cam_imu" in finding.fix
+
+
 def test_a_detector_that_barely_turns_with_the_gyroscope_is_not_called_late(good_log, tmp_path) -> None:
     """Where rotations err for tenths of a second, the best of many offsets is one by chance: here 85 ms."""
     poses = good_log.object_poses[""]
