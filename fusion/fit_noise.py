@@ -140,8 +140,8 @@ def _good_errors(
     seen, scatters = 0, []
     for log in logs:
         poses = log.detections(detections)[1]
-        for object_id, stamps, errors in _object_errors(log, poses):
-            keep = _is_good(errors, options)
+        for object_id, stamps, errors in object_errors(log, poses):
+            keep = is_good(errors, options)
             seen += len(keep)
             if np.count_nonzero(keep) >= options.min_detections:
                 found.setdefault(object_id, []).append((stamps[keep], errors[keep]))
@@ -174,7 +174,7 @@ def _shrinkage(means: dict[int, Array]) -> dict[int, Array]:
 _STEP_S = 0.1
 
 
-def _object_errors(log: Log, poses: ObjectPoses) -> Iterator[tuple[int, Stamps, Array]]:
+def object_errors(log: Log, poses: ObjectPoses) -> Iterator[tuple[int, Stamps, Array]]:
     """Yield id, stamps (N,) and errors (N, 6) [rotation, across x, across y, along] of each object of a log."""
     if log.T_world_cam is None or log.landmark_map is None:
         raise InputError("fitting needs T_world_cam.tum and landmarks.json", path=log.path, fix="choose another log")
@@ -194,7 +194,8 @@ def _object_errors(log: Log, poses: ObjectPoses) -> Iterator[tuple[int, Stamps, 
         yield thing.object_id, poses.stamps_ns[mine], np.column_stack([rotation, across, along])
 
 
-def _is_good(errors: Array, options: FitNoiseOptions) -> NDArray[np.bool_]:
+def is_good(errors: Array, options: FitNoiseOptions) -> NDArray[np.bool_]:
+    """Tell which errors (N, 6) are no gross ones."""
     near = np.linalg.norm(errors[:, 3:], axis=1) < options.gross_distance
     return near & (np.linalg.norm(errors[:, :3], axis=1) < math.radians(options.gross_angle_deg))
 
