@@ -27,6 +27,7 @@ _FURTHEST_S, _SETTLED_S = 0.1, 1e-4
 _STRETCH_S = 2.0  # errors of turn rates last less long
 _LEAST_STRETCHES = 4
 _CLEAR, _CLEAR_SIGMA_S = 3.5, 0.1
+_ABOVE_CHANCE, _NO_CHANCE = 0.1, 0.5  # of correlations
 LEAST_SAMPLES = 25
 
 
@@ -38,6 +39,8 @@ class TurnOffset:
     """The pose of stamp t belongs to the IMU at t + offset."""
     sigma_s: float
     """Its 1-sigma, from how stretches of the log scatter."""
+    correlation: float
+    """-1 .. 1 there, under the best rotation."""
     lead: float
     """By how many of its standard errors it fits better than the best offset further than 0.3 s away."""
     background: float
@@ -46,7 +49,8 @@ class TurnOffset:
     @property
     def distinct(self) -> bool:
         """Whether it stands out: a log that barely turns, or turns in a rhythm, says nothing."""
-        return self.lead > _CLEAR and self.sigma_s < _CLEAR_SIGMA_S
+        by_chance = min(self.background + _ABOVE_CHANCE, _NO_CHANCE)
+        return self.lead > _CLEAR and self.sigma_s < _CLEAR_SIGMA_S and self.correlation > by_chance
 
 
 def find_offset(gyroscope: GyroscopeIntegral, rates: TurnRates) -> TurnOffset | None:
@@ -65,7 +69,8 @@ def find_offset(gyroscope: GyroscopeIntegral, rates: TurnRates) -> TurnOffset | 
         offset, sigma = coarse, float("inf")
     rivals = np.where(away > _APART_S, scores, -1.0)
     rival = _Fit.at(gyroscope, rates, float(lags[np.argmax(rivals)]), 4) if rivals.max() > -1.0 else found
-    return TurnOffset(offset, sigma, _lead(rates, found, rival), float(scores[away > 1.0].max(initial=0.0)))
+    background = float(scores[away > 1.0].max(initial=0.0))
+    return TurnOffset(offset, sigma, float(scores.max()), _lead(rates, found, rival), background)
 
 
 def _lead(rates: TurnRates, found: _Fit, rival: _Fit) -> float:

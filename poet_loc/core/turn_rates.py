@@ -52,9 +52,8 @@ class PoseStream:
     @classmethod
     def of_detections(cls, poses: ObjectPoses) -> PoseStream:
         """Take what objects seen by a camera say of its turning."""
-        keys = np.column_stack([poses.object_ids, poses.instances])
-        groups = np.unique(keys, axis=0, return_inverse=True)[1].ravel()
-        return cls(poses.stamps_ns, groups, poses.T_cam_obj.rotation, True)
+        ids, instances = (np.unique(each, return_inverse=True)[1] for each in (poses.object_ids, poses.instances))
+        return cls(poses.stamps_ns, ids * len(poses) + instances, poses.T_cam_obj.rotation, True)
 
     @classmethod
     def of_camera_poses(cls, poses: CameraPoses) -> PoseStream:
@@ -75,12 +74,11 @@ def turn_rates(stream: PoseStream) -> TurnRates:
     turn = one * two.inv() if stream.of_object else one.inv() * two
     start, end = stream.stamps_ns[first], stream.stamps_ns[second]
     rates = np.reshape(turn.as_rotvec(), (-1, 3)) / ((end - start) / 1e9)[:, None]
-    intervals, row = np.unique(np.column_stack([start, end]), axis=0, return_inverse=True)
-    if len(intervals) < len(rates):
-        rates = _medians(rates, row.ravel(), len(intervals))
-    else:
-        rates = rates[np.argsort(row.ravel())]
-    return TurnRates(intervals[:, 0], intervals[:, 1], rates)
+    frames = np.unique(stream.stamps_ns)
+    intervals = np.searchsorted(frames, start) * len(frames) + np.searchsorted(frames, end)
+    intervals, row = np.unique(intervals, return_inverse=True)
+    rates = _medians(rates, row, len(intervals))
+    return TurnRates(frames[intervals // len(frames)], frames[intervals % len(frames)], rates)
 
 
 def believable(imu: ImuSamples, rates: TurnRates) -> TurnRates:
