@@ -12,7 +12,7 @@ from fusion.columns import OUT_CORE, OUT_SIGMA, Columns, Rows
 from fusion.compiled import njit
 from fusion.eskf import ACCEPTED, REJECTED
 from fusion.filter_motion import advance, begin, find_rate
-from fusion.filter_update import LIMIT_BOTH, follow_jumps, forget_biases, is_unsettled, put_object, take
+from fusion.filter_update import LIMIT_BOTH, follow_jumps, forget_biases, is_lost, is_unsettled, put_object, take
 from fusion.measurements import OBJECT_POSE, ODOMETRY_STEP
 from fusion.meeting import PUT, START_AGAIN, UNKNOWN_MAP, choose_anchor, forget_rivals, suppose
 from fusion.memory import (
@@ -29,6 +29,7 @@ from fusion.memory import (
     RESTARTS,
     STARTED_AT,
     TRACKING,
+    UNSURE_AT,
     Memory,
     Work,
     views,
@@ -148,6 +149,8 @@ def measure(m: Memory, w: Work, log: Columns, first: int, last: int) -> None:
             choose_anchor(m, log.kinds, log.objects, poses, last)
         follow_spreads(m, log, poses, last)
         if c[MODE] == TRACKING:
+            if is_lost(m) and c[UNSURE_AT] <= c[LAST_UPDATE]:
+                c[UNSURE_AT] = c[NOW]
             _take_poses(m, w, log, poses, last)
             _meet_objects(m, w, log, poses, last)
         account(m, w, log, poses, last)

@@ -14,15 +14,13 @@ from fusion.memory import (
     LAST_STAMP,
     MODE,
     NOW,
-    STARTED_AT,
     TRACKING,
     UP_COUNT,
-    VOTE_HEAD,
     Memory,
     Work,
 )
 from fusion.nav_state import AT_GRAVITY, GRAVITY, GYRO_BIAS, POSITION, Array, Ints
-from fusion.odometry import FAR_TURN, IS_ODOMETRY, ROTATION_DOUBT, move_by_odometry, spread_by_odometry
+from fusion.odometry import IS_ODOMETRY, move_by_odometry, spread_by_odometry
 from fusion.tape import note_odometry, note_step
 
 
@@ -59,8 +57,6 @@ def advance(m: Memory, w: Work, imu_stamps: Ints, imu_values: Array, until: int)
         dt = (stop - c[NOW]) * 1e-9
         if m.noise[IS_ODOMETRY] > 0.0:
             _advance_by_odometry(m, w, dt, imu_values[k])
-            if stop == end and imu_values[k, ROTATION_DOUBT] * (end - start) * 1e-9 > FAR_TURN**2:
-                c[VOTE_HEAD], c[STARTED_AT] = 0, stop  # whatever was seen before says nothing of where this is
         elif c[MODE] == TRACKING:
             _advance_by_imu(m, w, dt, (end - start) * 1e-9, rate, force, imu_values[k + 1])
         else:

@@ -9,6 +9,7 @@ import numpy as np
 from fusion.columns import Columns, read, read_fitted
 from fusion.compiled import njit
 from fusion.eskf import ACCEPTED, POSITION_ONLY, REJECTED, ROTATION_ONLY, correct, gate, innovation
+from fusion.imu import GUESSED
 from fusion.measurements import OBJECT_POSE, object_in_world, residual_and_jacobian
 from fusion.meeting import UNKNOWN_MAP
 from fusion.memory import MODE, TRACKING, Memory, Work
@@ -72,10 +73,18 @@ def is_blunder(m: Memory, nis_rotation: float) -> bool:
 
 
 @njit(cache=True)
+def is_lost(m: Memory) -> bool:
+    """Tell whether the state is so unsure of its attitude that it may be anywhere.
+
+    Not where its motion is but a guess: what carries the votes to each other would be no better.
+    """
+    return m.noise[GUESSED] == 0.0 and m.P[0, 0] + m.P[1, 1] + m.P[2, 2] > LINEAR**2
+
+
+@njit(cache=True)
 def is_far(m: Memory, residual: Array) -> bool:
     """Tell whether a rotation is so far off, and the attitude so unsure, that what is linear there does not hold."""
-    unsure = m.P[0, 0] + m.P[1, 1] + m.P[2, 2] > LINEAR**2
-    return unsure and residual[0] ** 2 + residual[1] ** 2 + residual[2] ** 2 > LINEAR**2
+    return is_lost(m) and residual[0] ** 2 + residual[1] ** 2 + residual[2] ** 2 > LINEAR**2
 
 
 @njit(cache=True)

@@ -33,7 +33,7 @@ from fusion.so3_kernels import apply, exp_so3, left_jacobian, multiply, orthonor
 
 # Places in the noise array (densities in Kalibr's units, then the uncertainty of a bridged gap).
 GYRO_NOISE, ACCEL_NOISE, GYRO_WALK, ACCEL_WALK, GAP_S, GAP_RATE, GAP_ACCEL = range(7)
-MEASURED = 10  # 1 where the samples' own noise counts, behind those of odometry.py
+MEASURED, GUESSED = 10, 11  # 1 where the samples' own noise counts; where there is none, and motion is but a guess
 
 
 @njit(cache=True)

@@ -37,8 +37,9 @@ VOTES = 256  # a second of eight objects at 30 Hz; a power of two, so that place
     DELAY,  # by how much later than their stamps measurements are taken in, ns
     LEAST_DELAY,  # the least that this ever was
     LAST_STAMP,  # of the measurements taken in last
+    UNSURE_AT,  # when the attitude was last so unsure that poses are judged anew: votes from before do not count
     N_COUNTERS,
-) = range(18)
+) = range(19)
 INITIALISING, TRACKING = 0, 1
 
 TALLY_SIZE, PLACE_SIZE = 8, 15  # rows of tallies and places, see place_watch.py

@@ -25,8 +25,6 @@ IS_ODOMETRY, ROTATION_WALK, TRANSLATION_WALK = 7, 8, 9
 # of the motion until the next one (`believed_samples`).
 ROTATION_DOUBT, TRANSLATION_DOUBT = 6, 7
 
-FAR_TURN = 0.3  # rad, 1-sigma: a motion known no better than that may lead to where nothing is linear any more
-
 
 def odometry_samples(T_odom_cam: Trajectory, T_cam_body: RigidTransform) -> ImuSamples:
     """Return the body's twist from each pose of the odometry to the next, in the place of IMU samples.

@@ -237,7 +237,7 @@ def motion_noise(problem: Problem, options: FuseOptions) -> Array:
     noise[[imu.GYRO_WALK, imu.ACCEL_WALK]] = own.gyroscope_random_walk, own.accelerometer_random_walk
     noise[[imu.GAP_RATE, imu.GAP_ACCEL]] = gap.angular_rate, gap.acceleration
     noise[imu.GAP_S] = gap.longest_s if with_imu else math.inf
-    noise[imu.MEASURED] = options.imu.measured and with_imu
+    noise[imu.MEASURED], noise[imu.GUESSED] = options.imu.measured and with_imu, problem.motion == "constant-velocity"
     if problem.motion == "odometry":
         noise[odometry.IS_ODOMETRY] = 1.0
         noise[odometry.ROTATION_WALK] = math.radians(options.odometry.rotation_walk_deg)

@@ -94,10 +94,6 @@ class ReferenceFilter:
                 values = imu_values[k] + share * (imu_values[k + 1] - imu_values[k])
                 self._step((stop - now) * 1e-9, (imu_stamps[k + 1] - imu_stamps[k]) * 1e-9, values, imu_values[k + 1])
             c[memory.NOW] = stop
-            if stop == imu_stamps[k + 1] and m.noise[odometry.IS_ODOMETRY]:
-                turn = imu_values[k, odometry.ROTATION_DOUBT] * (imu_stamps[k + 1] - imu_stamps[k]) * 1e-9
-                if turn > odometry.FAR_TURN**2:
-                    c[memory.VOTE_HEAD], c[memory.STARTED_AT] = 0, stop
             c[memory.IMU_AT] += stop == imu_stamps[k + 1]
 
     def _step(self, dt: float, interval: float, values: Array, sample: Array) -> None:
@@ -273,6 +269,8 @@ class ReferenceFilter:
             choose_anchor(m, kinds, log.objects, first, last)
         follow_spreads(m, log, first, last)
         if self.tracking:
+            if filter_update.is_lost(m) and c[memory.UNSURE_AT] <= c[memory.LAST_UPDATE]:
+                c[memory.UNSURE_AT] = c[memory.NOW]
             for j in self.order(first, last, log):
                 decisions[j] = self.take(log, j)
             for j in range(first, last if (decisions[first:last] & ACCEPTED).any() else first):

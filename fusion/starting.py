@@ -35,6 +35,7 @@ from fusion.memory import (
     RESTARTS,
     STARTED_AT,
     TRACKING,
+    UNSURE_AT,
     VOTE_HEAD,
     Memory,
     Work,
@@ -162,11 +163,17 @@ def _write_variances(m: Memory, k: int, p_co: Array, covariance: Array, vote: Ar
 
 @njit(cache=True)
 def _first_vote(m: Memory, window_s: float, wanted: int) -> int:
-    """Return where the votes of the window start; a window with fewer than wanted votes reaches further back."""
+    """Return where the votes of the window start; a window with fewer than wanted votes reaches further back.
+
+    None reaches back to before the state lost its attitude.
+    """
     head, capacity = m.counters[VOTE_HEAD], len(m.vote_stamps)
     first = head
     while first > 0 and head - first < capacity - 1:
-        age = (m.counters[NOW] - m.vote_stamps[(first - 1) & (capacity - 1)]) * 1e-9
+        cast_at = m.vote_stamps[(first - 1) & (capacity - 1)]
+        age = (m.counters[NOW] - cast_at) * 1e-9
+        if cast_at < m.counters[UNSURE_AT]:
+            break
         if age > m.start[LONGEST_WINDOW_S] or (age > window_s and head - first >= wanted):
             break
         first -= 1

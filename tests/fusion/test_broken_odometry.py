@@ -163,6 +163,17 @@ def test_fed_one_by_one_a_jump_is_refused_as_in_the_whole_log():
     assert BREAK_S < refused[0] < BREAK_S + 0.4
 
 
+@pytest.mark.parametrize("length_s", [2.0, 3.0])
+def test_after_a_gap_of_the_imu_the_votes_since_then_say_where_it_is(log, length_s):
+    """The attitude may be any, and what was seen before says nothing of it."""
+    seconds = seconds_of(log.imu.stamps_ns, log)
+    gap = replace(log, imu=log.imu[(seconds < BREAK_S - length_s) | (seconds > BREAK_S)])
+    seconds, position, angle, _ = errors(fuse(blinded(gap, length_s), FuseOptions(motion="imu")), log)
+    later = seconds > BREAK_S + 0.5
+    assert position[later].max() < 0.1
+    assert angle[later].max() < 6.0
+
+
 def test_odometry_that_begins_late_and_ends_early_leaves_the_rest_to_the_detections(log):
     odometry = log.T_odom_cam
     seconds = seconds_of(odometry.stamps_ns, log)
