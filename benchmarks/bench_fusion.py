@@ -28,7 +28,8 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from fusion.fuse import run_filter
+from fusion.coarse_offset import coarse_offset
+from fusion.fuse import fuse, run_filter
 from fusion.measurements import OBJECT_POSE
 from fusion.nav_state import StateLayout
 from fusion.online import Estimator
@@ -277,10 +278,24 @@ def main() -> None:
     print(
         f"8 objects in the state: {fast['8, camera'].whole_s / fast['0'].whole_s:.1f} x the cost of none (goal: <= 4)"
     )
+    share = coarse_share(arguments.seconds)
+    print(f"time offset from turn rates, before a log of 8 objects is fused: {share:.2f} x the cost of the filter")
     wall, cpu = warm_start()
     print(f"warm start, import to the estimate of a 5 s log: {wall:.2f} s, {cpu:.2f} s CPU (goal: < 1 s)")
     for way in ("one call", "streaming", "reference", "gtsam") if Path("/proc/self/clear_refs").exists() else ():
         print(f"peak memory of the whole log, {way}: {peak_memory(arguments, way):.1f} MB")
+
+
+def coarse_share(seconds: float) -> float:
+    """Return what finding a log's time offset before it is fused costs beside the filter on 8 objects."""
+    log = simulate(SimulationOptions(duration_s=seconds))
+    poses, cost = log.object_poses[""], {}
+    for name, call in (("offset", lambda: coarse_offset(log, object_poses=poses)), ("filter", lambda: fuse(log))):
+        call()
+        began = time.process_time()
+        call()
+        cost[name] = time.process_time() - began
+    return cost["offset"] / cost["filter"]
 
 
 def print_ratios(problem: Problem, found: dict[str, Cost]) -> None:

@@ -25,6 +25,7 @@ _DEGREES = 180.0 / np.pi
 _UNIT_MARGIN = 3.0  # on real detections the scale is off by less than 2
 _FAINT, _ABOVE_CHANCE = 0.2, 0.1  # correlation from which a source tells that much
 _LEAST_IMU = 50  # samples
+_SAME_OFFSET_S = 0.03
 
 
 @dataclass(frozen=True)
@@ -251,19 +252,20 @@ def _offsets(log: Log, compared: list[_Compared]) -> Iterator[Finding]:
     late = []
     for each in compared:
         expected = stated if each.source.body == "cam" else 0.0
-        late.append((each, each.match.offset.offset_s - expected, each.match.contradicts(expected)))
-    of_camera = [(each, off) for each, off, wrong in late if each.source.body == "cam" and wrong]
-    cameras = [each for each, _, _ in late if each.source.body == "cam"]
-    offsets = [each.match.offset.offset_s for each, _ in of_camera]
-    agree = bool(offsets) and len(of_camera) == len(cameras) and float(np.ptp(offsets)) < 0.03
-    for each, off, wrong in late:
-        if not wrong:
-            continue
+        if each.match.contradicts(expected):
+            late.append((each, each.match.offset.offset_s - expected))
+    of_camera = [each for each, _ in late if each.source.body == "cam"]
+    best = max(of_camera, key=lambda each: each.match.correlation, default=None)
+    agree = best is not None and all(_agree(best, each) for each in compared if each.source.body == "cam")
+    for each, off in late:
         shared = agree and each.source.body == "cam"
-        best = max(of_camera, key=lambda pair: pair[0].match.correlation)[0] if shared else each
-        if shared and each is not best:
-            continue
-        yield _offset_finding(each, off, stated, shared and log.calibration is not None)
+        if not shared or each is best:
+            yield _offset_finding(each, off, stated, shared and log.calibration is not None)
+
+
+def _agree(best: _Compared, other: _Compared) -> bool:
+    apart = abs(other.match.offset.offset_s - best.match.offset.offset_s)
+    return apart < max(_SAME_OFFSET_S, other.match.offset_error_s)
 
 
 def _offset_finding(each: _Compared, off: float, stated: float, shared: bool) -> Finding:

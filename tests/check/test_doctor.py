@@ -100,6 +100,20 @@ def test_a_time_offset_is_told_of_detections_that_turn_little_like_the_gyroscope
     assert "set timeshift_cam_imu" in finding.fix
 
 
+def test_one_camera_has_one_time_offset(shared_data, tmp_path) -> None:
+    """Its odometry tells 80 ms; the detections, which alone would not, do not speak against it."""
+    log = read_log(shared_data / "ycbv_dope" / "0055")
+    late = 80_000_000
+    poses, odometry = log.object_poses["supervised"], log.T_odom_cam
+    detections = {"": replace(poses, stamps_ns=poses.stamps_ns + late)}
+    odometry = replace(odometry, stamps_ns=odometry.stamps_ns + late)
+    log = replace(log, object_poses=detections, T_odom_cam=odometry, T_world_cam=None, T_world_imu=None, frames=None)
+    write_log(tmp_path, log)
+    (finding,) = diagnose(tmp_path).findings
+    assert (finding.check, finding.file) == ("time-offset", "T_odom_cam.tum")
+    assert "set timeshift_cam_imu: -0.07" in finding.fix
+
+
 def test_a_detector_that_barely_turns_with_the_gyroscope_is_not_called_late(good_log, tmp_path) -> None:
     """Where rotations err for tenths of a second, the best of many offsets is one by chance: here 85 ms."""
     poses = good_log.object_poses[""]
