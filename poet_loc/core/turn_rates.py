@@ -70,6 +70,8 @@ class PoseStream:
 def turn_rates(stream: PoseStream) -> TurnRates:
     """Return the turn rates of a stream about a fifth of a second apart; of several objects the median."""
     first, second = _pairs(stream.stamps_ns, stream.groups)
+    if not len(first):
+        return TurnRates(stream.stamps_ns[:0], stream.stamps_ns[:0], np.zeros((0, 3)))
     one, two = stream.rotations[first], stream.rotations[second]
     turn = one * two.inv() if stream.of_object else one.inv() * two
     start, end = stream.stamps_ns[first], stream.stamps_ns[second]

@@ -59,6 +59,12 @@ def test_a_still_log_says_nothing(seed):
     assert match is None or not match.offset.distinct
 
 
+@pytest.mark.parametrize("kept", [0, 1, 40])
+def test_a_handful_of_detections_says_nothing(kept):
+    log = simulate(SimulationOptions(duration_s=4.0, seed=0))
+    assert match_turns(log.imu, turn_rates(PoseStream.of_detections(log.object_poses[""][:kept]))) is None
+
+
 def test_turning_in_a_rhythm_says_nothing():
     """Every whole period is as good: here 0.8 s."""
     t = np.arange(0.0, 20.0, 0.005)
