@@ -259,7 +259,7 @@ def _tell_of_time_offset(log: Log, detections: str | None, options: FuseOptions,
     match = coarse_offset(log, object_poses=None if detections is None else log.object_poses[detections])
     if match is None or not match.contradicts(stated):
         return
-    found = f"{match.offset.offset_s:.3f} +- {match.offset.sigma_s:.3f} s"
+    found = f"{match.offset.offset_s:.3f} s (to {1e3 * match.offset_error_s:.0f} ms)"
     what = f"the poses turn as the gyroscope does at timeshift_cam_imu: {found}, not at {stated:g} s"
     fix = "put it into calibration.yaml, or see --estimate.time-offset"
     report.note(f"{log.path}: {what}; {'the estimate begins there' if options.estimate.time_offset else fix}")
