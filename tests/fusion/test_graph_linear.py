@@ -18,6 +18,7 @@ from fusion.graph_motion import MotionChain
 from fusion.graph_smoother import add_measurements, detection_of
 from fusion.graph_walk import Walk
 from fusion.measurements import OBJECT_POSE
+from fusion.nav_state import SPREAD_SIZE
 from fusion.options import FuseOptions, Graph
 
 
@@ -81,7 +82,10 @@ def test_measurements_linearised_together_say_what_each_of_their_factors_says(na
 
 
 def test_what_an_object_bias_says_is_exact_at_its_latest_value():
-    """A bias that has come far since its variable began: at what it is now, the rows are the error there."""
+    """A bias that has come far since its variable began: at what it is now, the rows are the error there.
+
+    It spreads as it did when the filter used the measurement, whatever it does by now.
+    """
     options = FuseOptions(graph=Graph(kernel="none"))
     problem = replace(simulated(duration_s=3.0), layout=replace(LAYOUTS["everything"], time_offset=False))
     walk, chain = Walk(problem, options), MotionChain.of(problem, options)
@@ -94,11 +98,14 @@ def test_what_an_object_bias_says_is_exact_at_its_latest_value():
     for variable in biases:
         builder.x[variable.place] += 0.2 * rng.normal(size=6)
     steps, here, expected = gtsam.VectorValues(), gtsam.Values(), 0.0
+    spreads, x = walk.fitted.spreads, builder.x.copy()
+    spreads[:] = rng.uniform(0.5, 2.0, spreads.shape)
     for i in keyframe.at:
         passed = int(walk.columns.decisions[i]) & ACCEPTED
         if passed:
-            d = detection_of(builder, walk, i, keyframe.stamp_ns, builder.x, passed)
-            rows, (e, _) = slice(d.first, d.first + d.size), error_at(d, builder.x, layout)
+            x[layout.spread_start + SPREAD_SIZE * walk.columns.objects[i] :][:3] = spreads[i]
+            d = detection_of(builder, walk, i, keyframe.stamp_ns, x, passed)
+            rows, (e, _) = slice(d.first, d.first + d.size), error_at(d, x, layout)
             expected += 0.5 * e @ np.linalg.solve(d.covariance[rows, rows], e)
     add_measurements(builder, walk, keyframe.at)
     for variable in builder.newest:

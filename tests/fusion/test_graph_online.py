@@ -14,7 +14,7 @@ from fusion.graph import run_graph
 from fusion.graph_online import GraphEstimator
 from fusion.measurements import Measurements
 from fusion.online import OnlineOptions
-from fusion.options import Estimate, FuseOptions, Graph
+from fusion.options import DetectionBias, Estimate, FuseOptions, Graph
 from fusion.prepare import time_shift_ns
 
 OPTIONS = FuseOptions(estimator="graph", graph=Graph(lag_s=0.8))
@@ -126,8 +126,12 @@ def test_buffers_turn_over_and_nothing_grows():
 
 
 def test_poses_with_pauses_while_buffers_turn_over():
-    """Keyframes without poses, poses between keyframes, and room for four seconds of them in a log of twelve."""
-    options = replace(OPTIONS, graph=Graph(lag_s=0.4, keyframe_rate_hz=4.0, idle_s=0.3))
+    """Keyframes without poses, poses between keyframes, and room for four seconds of them in a log of twelve.
+
+    Each pose has the biases' spread that the filter knew when it came, which moves with it.
+    """
+    scatter = DetectionBias(scatter_rotation_deg=1.0, scatter_across=0.002, scatter_along=0.01)
+    options = replace(OPTIONS, bias=scatter, graph=Graph(lag_s=0.4, keyframe_rate_hz=4.0, idle_s=0.3))
     problem = simulated(options=options, duration_s=12.0)
     m = problem.measurements
     seconds = (m.stamps_ns - m.stamps_ns[0]) * 1e-9
