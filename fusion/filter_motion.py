@@ -6,7 +6,14 @@ import math
 
 from fusion.ballot import START_WINDOW_S
 from fusion.compiled import njit
-from fusion.imu import mean_until, propagate_covariance, propagate_nominal, transition_blocks, write_gravity_basis
+from fusion.imu import (
+    GUESSED,
+    mean_until,
+    propagate_covariance,
+    propagate_nominal,
+    transition_blocks,
+    write_gravity_basis,
+)
 from fusion.memory import (
     BIAS_TIME,
     IMU_AT,
@@ -14,8 +21,10 @@ from fusion.memory import (
     LAST_STAMP,
     MODE,
     NOW,
+    RESTARTS,
     TRACKING,
     UP_COUNT,
+    VOTE_HEAD,
     Memory,
     Work,
 )
@@ -65,6 +74,24 @@ def advance(m: Memory, w: Work, imu_stamps: Ints, imu_values: Array, until: int)
         c[NOW] = stop
         if stop == end:
             c[IMU_AT] = k + 1
+    give_up_where_anywhere(m, imu_values[c[IMU_AT], 3:6])
+
+
+@njit(cache=True)
+def give_up_where_anywhere(m: Memory, specific_force: Array) -> None:
+    """Wait for a new start where the motion is but a guess and, by now, the camera may look anywhere.
+
+    What a filter makes of detections there is a turn and a speed that nobody saw, which then carry it further away.
+    """
+    c = m.counters
+    guessed = c[MODE] == TRACKING and m.noise[GUESSED] > 0.0
+    if guessed and not m.P[0, 0] + m.P[1, 1] + m.P[2, 2] < math.pi**2:
+        last = c[LAST_STAMP]
+        begin(m, c[NOW], specific_force, c[IMU_AT])
+        c[LAST_STAMP], c[VOTE_HEAD] = last, 0
+        c[RESTARTS] += 1
+        for i in range(3):
+            m.x[GYRO_BIAS + i] = 0.0
 
 
 @njit(cache=True)

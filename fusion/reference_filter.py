@@ -95,6 +95,7 @@ class ReferenceFilter:
                 self._step((stop - now) * 1e-9, (imu_stamps[k + 1] - imu_stamps[k]) * 1e-9, values, imu_values[k + 1])
             c[memory.NOW] = stop
             c[memory.IMU_AT] += stop == imu_stamps[k + 1]
+        filter_motion.give_up_where_anywhere(m, imu_values[c[memory.IMU_AT], 3:6])
 
     def _step(self, dt: float, interval: float, values: Array, sample: Array) -> None:
         m = self.m
