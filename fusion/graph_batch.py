@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 
 import gtsam
@@ -60,7 +60,9 @@ class Stretch:
     """Per keyframe (kinds * K, 6): 1-sigma of what may have become of each object bias since."""
     values: gtsam.Values = field(default_factory=gtsam.Values)
     tree: gtsam.GaussianBayesTree | None = None
-    """The solution's linear system, eliminated."""
+    """The solution's linear system, eliminated,"""
+    graph: gtsam.NonlinearFactorGraph = field(default_factory=gtsam.NonlinearFactorGraph)
+    """and the graph that it is of."""
 
 
 def run_batch(problem: Problem, options: FuseOptions) -> FuseResult:
@@ -128,7 +130,8 @@ def _approach(stretch: Stretch, builder: GraphBuilder, walk: Walk, options: Grap
 
 def _solve(stretch: Stretch, builder: GraphBuilder, walk: Walk, steps: int) -> None:
     """Build the graph of a stretch from its states, and put the optimum in their place."""
-    stretch.values, stretch.tree = optimise(*_build(stretch, builder, walk), steps)
+    stretch.graph, values = _build(stretch, builder, walk)
+    stretch.values, stretch.tree = optimise(stretch.graph, values, steps)
     stretch.spread = [_read_state(stretch, i, builder) for i in range(len(stretch.states))]
 
 
@@ -258,8 +261,22 @@ def _joint(stretch: Stretch, i: int, with_imu: bool) -> Array:
     half = len(variables) // 2
     blocks = [v.to_filter(stretch.states[i + (n >= half)]) for n, v in enumerate(variables)]
     J = block_diagonal(blocks)
+    return np.asarray(J @ _covariance(stretch, [v.key for v in variables]) @ J.T)
+
+
+def _covariance(stretch: Stretch, keys: Sequence[int]) -> Array:
+    """Return the joint covariance of a solution's variables in this order.
+
+    Where hardly anything ties keyframes together (a hole of the odometry), gtsam's shortcuts through the tree may call
+    a sound system indeterminate; they do not through a tree that was eliminated by nested dissection.
+    """
     assert stretch.tree is not None
-    return np.asarray(J @ joint_covariance(stretch.tree, [v.key for v in variables]) @ J.T)
+    try:
+        return joint_covariance(stretch.tree, keys)
+    except RuntimeError:
+        linear = stretch.graph.linearize(stretch.values)
+        stretch.tree = linear.eliminateMultifrontal(gtsam.Ordering.OrderingType.METIS, gtsam.EliminateQR)
+        return joint_covariance(stretch.tree, keys)
 
 
 def _put_rows(walk: Walk, rows: slice, core: Array, covariance: Array) -> None:
@@ -278,4 +295,4 @@ def _write_statics(stretch: Stretch, builder: GraphBuilder, m: memory.Memory) ->
         variable.read(stretch.values, m.x)
     at = [i for variable in variables for i in variable.errors]
     J = block_diagonal([variable.to_filter(m.x) for variable in variables])
-    m.P[np.ix_(at, at)] = J @ joint_covariance(stretch.tree, [variable.key for variable in variables]) @ J.T
+    m.P[np.ix_(at, at)] = J @ _covariance(stretch, [variable.key for variable in variables]) @ J.T

@@ -97,8 +97,13 @@ def odometry_spread(options: FuseOptions) -> NDArray[np.float64]:
 
 
 def _odometry_of(log: Log) -> Trajectory:
-    if log.T_odom_cam is None or len(log.T_odom_cam) < 2:
+    if log.T_odom_cam is None:
         raise InputError("the log has no T_odom_cam.tum", path=log.path, fix="choose another --motion")
+    if len(log.T_odom_cam) < 2:
+        file = log.path / "T_odom_cam.tum"
+        raise InputError(
+            "has one pose, which tells no motion", path=file, fix="give two or more, or choose another --motion"
+        )
     return log.T_odom_cam
 
 

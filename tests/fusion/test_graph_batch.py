@@ -231,3 +231,20 @@ def test_the_batch_pushes_nothing_away():
         apart = batch.T_world_imu.translation - smoothed.T_world_imu.translation
         behind.append(-np.mean(np.sum(apart * ahead, axis=1)))
     assert np.abs(np.mean(behind)) < 0.006
+
+
+def test_what_shortcuts_through_the_tree_call_indeterminate_is_found_without_them(monkeypatch):
+    log = simulate(SimulationOptions(duration_s=3.0, imu_rate_hz=100.0, camera_rate_hz=10.0, objects=3, odometry=True))
+    options = FuseOptions(estimator="batch", motion="odometry")
+    expected, asked = fuse(log, options), []
+
+    def indeterminate(tree, keys):
+        asked.append(keys)
+        if len(asked) in (2, 9):
+            raise RuntimeError("Indeterminate linear system detected")
+        return joint_covariance(tree, keys)
+
+    monkeypatch.setattr(graph_batch, "joint_covariance", indeterminate)
+    found = fuse(log, options)
+    assert len(asked) > 10
+    np.testing.assert_allclose(found.pose_covariances, expected.pose_covariances, rtol=1e-3, atol=1e-12)

@@ -137,6 +137,8 @@ def test_odometry_beside_the_imu_is_smoothed_and_must_be_there(log):
     assert rmse(fuse(gap, replace(options, smooth=True)), log) < rmse(fuse(gap, options), log)
     with pytest.raises(InputError, match=r"T_odom_cam\.tum"):
         fuse(replace(log, T_odom_cam=None), options)
+    with pytest.raises(InputError, match="has one pose"):
+        fuse(replace(log, T_odom_cam=log.T_odom_cam[:1]), options)
 
 
 def test_without_calibration_the_camera_itself_is_followed(log):
