@@ -19,7 +19,7 @@ from fusion.measurements import OBJECT_POSE, viewing_axes
 from fusion.memory import Memory
 from fusion.nav_state import N_BIAS_KINDS, SPREAD_COUNT, SPREAD_SIZE, SPREADS
 from fusion.options import DetectionBias, DetectionNoise
-from fusion.scatter import is_usual_known, spread_by_scatter
+from fusion.scatter import follow_mean, is_usual_known, spread_by_scatter
 
 Array = NDArray[np.float64]
 
@@ -89,12 +89,6 @@ def _follow_spread(m: Memory, k: int, R: Array, t: Array) -> None:
     floor = model[WHITE_FLOOR] ** 2
     x[at + SPREAD_COUNT] = min(x[at + SPREAD_COUNT] + 1.0, model[MEAN_OVER])
     gain = 0.5 / x[at + SPREAD_COUNT]
-    _follow(x, at, (R[0, 0] + R[1, 1] + R[2, 2]) / (3.0 * model[WHITE_ROTATION] ** 2), gain)
-    _follow(x, at + 1, across / (model[WHITE_ACROSS] ** 2 * squared + floor), gain)
-    _follow(x, at + 2, along / (model[WHITE_ALONG] ** 2 * squared + floor), gain)
-
-
-@njit(cache=True)
-def _follow(x: Array, i: int, variance: float, gain: float) -> None:
-    if 0.0 < variance < math.inf:
-        x[i] *= (variance / (x[i] * x[i])) ** gain
+    follow_mean(x, at, (R[0, 0] + R[1, 1] + R[2, 2]) / (3.0 * model[WHITE_ROTATION] ** 2), gain, math.inf)
+    follow_mean(x, at + 1, across / (model[WHITE_ACROSS] ** 2 * squared + floor), gain, math.inf)
+    follow_mean(x, at + 2, along / (model[WHITE_ALONG] ** 2 * squared + floor), gain, math.inf)

@@ -104,14 +104,14 @@ def _take_step(s: Array, t: Array, residual: Array) -> None:
         along += step * t[i]
     along = along * along / (squared * squared)
     across = moved / squared - along
-    _follow(s, 0, _OF_ROTATION * turned / 6.0)
-    _follow(s, 1, _OF_ACROSS * across / 4.0)
-    _follow(s, 2, _OF_ALONG * along / 2.0)
+    gain = 0.5 / (s[COUNT] + PRIOR_STEPS)
+    follow_mean(s, SIGMAS, _OF_ROTATION * turned / 6.0, gain, LARGEST_RATIO)
+    follow_mean(s, SIGMAS + 1, _OF_ACROSS * across / 4.0, gain, LARGEST_RATIO)
+    follow_mean(s, SIGMAS + 2, _OF_ALONG * along / 2.0, gain, LARGEST_RATIO)
 
 
 @njit(cache=True)
-def _follow(s: Array, part: int, variance: float) -> None:
-    sigma = s[SIGMAS + part]
-    ratio = variance / (sigma * sigma) if sigma > 0.0 else 0.0
-    if 0.0 < ratio < math.inf:
-        s[SIGMAS + part] *= min(ratio, LARGEST_RATIO) ** (0.5 / (s[COUNT] + PRIOR_STEPS))
+def follow_mean(x: Array, i: int, variance: float, gain: float, largest: float) -> None:
+    """Take a variance, no more than `largest` times that of 1-sigma x[i], into x[i], a running geometric mean."""
+    if x[i] > 0.0 and 0.0 < variance < math.inf:
+        x[i] *= min(variance / (x[i] * x[i]), largest) ** gain

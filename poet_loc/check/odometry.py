@@ -10,14 +10,15 @@ from poet_loc.check.finding import Evidence, Finding
 from poet_loc.core.odometry_breaks import Break, Expected, odometry_breaks
 from poet_loc.io.log_folder import Log
 
-_HAND_HELD = Expected((np.radians(0.25), 0.005), 0.1, (0.5, 0.3))
+EXPECTED = Expected((float(np.radians(0.25)), 0.005), 0.1, (0.5, 0.3))
+"""What fusion expects by default, whose options a check knows nothing of; a test holds the two together."""
 
 
 def check_odometry(log: Log) -> Iterator[Finding]:
     """Yield jumps and holes of T_odom_cam.tum, each kind once with where its worst is."""
     if log.T_odom_cam is None:
         return
-    breaks = odometry_breaks(log.T_odom_cam, _HAND_HELD)
+    breaks = odometry_breaks(log.T_odom_cam, EXPECTED)
     jumps, holes = [each for each in breaks if not each.hole], [each for each in breaks if each.hole]
     if jumps:
         what = "the odometry jumps: it relocalised or closed a loop"

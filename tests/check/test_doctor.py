@@ -16,8 +16,11 @@ sys.path.insert(0, str(Path(__file__).parent))
 
 from spoiled_logs import SPOILED_FILES, SPOILED_LOGS, imu, inverse_extrinsics, late_camera, write_spoiled
 
+from fusion.odometry import expected_of
+from fusion.options import FuseOptions
 from fusion.simulate import SimulationOptions, simulate
 from poet_loc.check.doctor import diagnose, write_repaired
+from poet_loc.check.odometry import EXPECTED
 from poet_loc.cli.main import main
 from poet_loc.core.geometry import make_pose
 from poet_loc.io.log_folder import read_log, write_log
@@ -151,3 +154,7 @@ def test_a_trajectory_in_nanoseconds_is_told_with_line_and_remedy(good_log, tmp_
     assert (finding.check, finding.file, finding.evidence["line"]) == ("unreadable", "T_world_imu.tum", 1)
     assert "is no time in seconds" in finding.what
     assert "TUM wants seconds" in finding.fix
+
+
+def test_odometry_is_expected_to_be_as_fusion_expects_it():
+    assert expected_of(FuseOptions()) == EXPECTED
