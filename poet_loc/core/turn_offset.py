@@ -26,6 +26,7 @@ _APART_S = 0.3  # an offset so far off is a rival
 _FURTHEST_S, _SETTLED_S = 0.1, 1e-4
 _STRETCH_S = 2.0  # errors of turn rates last less long
 _LEAST_STRETCHES = 4
+_STIFFNESS = 1e-3  # of the rotation: motion about one axis does not tell the turn about it
 _CLEAR, _CLEAR_SIGMA_S = 3.5, 0.1
 _ABOVE_CHANCE, _NO_CHANCE = 0.1, 0.5  # of correlations
 LEAST_SAMPLES = 25
@@ -121,8 +122,8 @@ class _Fit:
             J = np.concatenate([-skew(gain * w - bias), eye, -w[:, :, None], -gain * slope[:, :, None]], axis=2)
             weighted = J / (1.0 + squares / scale**2)[:, None, None]
             information = np.einsum("nij,nik->jk", weighted, J) + 1e-9 * np.eye(8)
-            scores = np.einsum("nij,ni->nj", weighted, residual)
-            step = -np.linalg.solve(information, scores.sum(axis=0))
+            information[:3, :3] += _STIFFNESS * np.trace(information[:3, :3]) * np.eye(3)
+            step = -np.linalg.solve(information, np.einsum("nij,ni->j", weighted, residual))
             R, bias, gain = Rotation.from_rotvec(step[:3]).as_matrix() @ R, bias + step[3:6], gain + step[6]
             before = offset_s
             offset_s = float(np.clip(offset_s + step[7], coarse - _FURTHEST_S, coarse + _FURTHEST_S))
@@ -130,16 +131,29 @@ class _Fit:
                 break
         every = np.zeros(len(rates))
         every[used] = squares
-        return cls(offset_s, _sigma(information, scores, _stretches(rates[used])), every, used, scale)
+        return cls(offset_s, _sigma(J, residual, scale, _stretches(rates[used])), every, used, scale)
 
 
-def _sigma(information: Array, scores: Array, stretch: NDArray[np.int64]) -> float:
-    """Return the offset's 1-sigma where errors last: the sums of whole stretches are what is independent."""
-    sums = np.zeros((int(stretch[-1]) + 1, 8))
-    np.add.at(sums, stretch, scores)
-    inverse = np.linalg.inv(information)
-    count = max(len(np.unique(stretch)), 2)
-    return float(np.sqrt((inverse @ (sums.T @ sums) @ inverse)[7, 7] * count / (count - 1)))
+def _sigma(J: Array, residual: Array, scale: float, stretch: NDArray[np.int64]) -> float:
+    """Return the offset's 1-sigma, from how it moves when one stretch is left out at a time (jackknife).
+
+    Within a stretch errors last. The second derivative is that of the weighted loss, whose weights fall with the
+    residuals; with few stretches the variance itself is uncertain, as in Student's t distribution.
+    """
+    first = np.flatnonzero(np.diff(stretch, prepend=-1))
+    if len(first) < _LEAST_STRETCHES:
+        return float("inf")
+    weight = 1.0 / (1.0 + np.sum(residual**2, axis=1) / scale**2)
+    scores = weight[:, None] * np.einsum("nij,ni->nj", J, residual)
+    second = weight[:, None, None] * np.einsum("nij,nik->njk", J, J)
+    second -= 2.0 / scale**2 * scores[:, :, None] * scores[:, None, :]
+    each, pull = np.add.reduceat(second, first), np.add.reduceat(scores, first)
+    others = each.sum(axis=0) - each + 1e-9 * np.eye(8)
+    if np.linalg.eigvalsh(others)[:, 0].min() <= 0.0:
+        return float("inf")
+    moved = np.linalg.solve(others, pull[:, :, None])[:, 7, 0]
+    freedom = len(first) - 1
+    return float(np.sqrt(np.sum(moved**2) * freedom / len(first) * freedom / (freedom - 2)))
 
 
 def _similarity(w: Array, w_pose: Array) -> tuple[Array, Array, float]:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -46,10 +48,40 @@ def test_an_offset_is_found_with_kalibrs_sign(offset_s, imu_hz, camera_hz, seed)
     assert match.contradicts(offset_s + 0.15)
 
 
-def test_its_sigma_is_honest():
-    logs = [simulate(SimulationOptions(duration_s=30.0, seed=seed, objects=4)) for seed in range(12)]
-    offsets = [matched(log).offset for log in logs]
-    assert 0.5 < np.sqrt(np.mean([(each.offset_s / each.sigma_s) ** 2 for each in offsets])) < 2.0
+@pytest.mark.parametrize(("duration_s", "noise"), [(10.0, "white"), (20.0, "network"), (30.0, "white")])
+def test_its_sigma_is_honest(duration_s, noise):
+    """Measured over 40 seeds: 0.9 to 1.2; over 16 it scatters by a fifth."""
+    options = SimulationOptions(duration_s=duration_s, objects=4, noise=noise)
+    offsets = [matched(simulate(replace(options, seed=seed))).offset for seed in range(16)]
+    ratios = [each.offset_s / each.sigma_s for each in offsets if each.distinct]
+    assert len(ratios) > 10
+    assert 0.6 < np.sqrt(np.mean(np.square(ratios))) < 1.4
+
+
+def planar(angle, noise_rad: float, seed: int) -> tuple[ImuSamples, PoseStream]:
+    """Return a body that turns about one axis, and its poses at 29 Hz; angle is a function of s."""
+    t, axis, rng = np.arange(0.0, 20.0, 0.005), np.array([0.3, 0.2, 0.9]), np.random.default_rng(seed)
+    rate = np.gradient(angle(t), t)[:, None] * axis + 0.002 * rng.normal(size=(len(t), 3))
+    imu = ImuSamples((t * 1e9).astype(np.int64), rate, np.tile([0.0, 0.0, 9.81], (len(t), 1)))
+    noise = Rotation.from_rotvec(noise_rad * rng.normal(size=(len(t[::7]), 3)))
+    seen = Rotation.from_rotvec(angle(t[::7])[:, None] * axis) * noise
+    return imu, PoseStream(imu.stamps_ns[::7], np.zeros(len(seen), np.int64), seen, False)
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_a_body_that_turns_about_one_axis_tells_its_offset(seed):
+    """The turn about that axis between body and IMU is not told, and leads nowhere."""
+    imu, stream = planar(lambda t: np.sin(0.7 * t + seed) + 0.4 * np.sin(2.3 * t) + 0.3 * np.sin(3.7 * t), 0.05, seed)
+    offset = match_turns(imu, turn_rates(stream)).offset
+    assert offset.distinct
+    assert abs(offset.offset_s) < 4.0 * offset.sigma_s
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_swinging_about_one_axis_says_nothing(seed):
+    """Half a period off is as good, with the IMU upside down."""
+    imu, stream = planar(lambda t: 0.5 * np.sin(2.0 * np.pi * t / 3.0), 0.05, seed)
+    assert not match_turns(imu, turn_rates(stream)).offset.distinct
 
 
 @pytest.mark.parametrize("seed", range(6))
