@@ -55,7 +55,8 @@ def believed_motion(stamps_ns: NDArray[np.int64], twists: Array, expected: Expec
     """Return what to believe of the twists (N, 6), per second, between N + 1 stamps.
 
     A twist may differ from the one that was believed before it by FAR times what is usual, and in a hole by what a
-    camera may do unseen; what it is off beyond that is taken off, and is a 1-sigma of what is not known.
+    camera may do unseen; what it is off beyond that is taken off, and is a 1-sigma of what is not known. It may
+    slow down at once: so jumps end. Before the first two the slower of them stands.
     """
     seconds = np.diff(stamps_ns) * 1e-9
     holes = holes_between(stamps_ns, expected.longest_s)
@@ -64,12 +65,13 @@ def believed_motion(stamps_ns: NDArray[np.int64], twists: Array, expected: Expec
         own = believed[:, 3 * part : 3 * part + 3]
         unseen = expected.unseen[part] * np.sqrt(holes * np.minimum(holes, _CORRELATED_S))
         loose = unseen / seconds
-        differences = np.linalg.norm(np.diff(own, axis=0, prepend=own[:1]), axis=1)
+        before = own[[np.argmin(np.linalg.norm(own[:2], axis=1))]]
+        differences = np.linalg.norm(np.diff(own, axis=0, prepend=before), axis=1)
         moved = expected.unseen[part] * np.minimum(seconds - holes, _CORRELATED_S)
         least = np.hypot(np.sqrt(6.0 / seconds) * expected.walk[part], moved)  # drift of both, and a change of motion
-        usual = np.maximum(_running_percentile(differences, 50.0), least)
+        usual = np.maximum(_running_percentile(differences, 50.0, unknown=2), least)
         limits = FAR * usual + loose + np.r_[0.0, loose[:-1]]
-        taken_off[:, part] = _hold(own, limits, differences > limits) * seconds
+        taken_off[:, part] = _hold(own, before[0], limits, differences > limits) * seconds
         sigmas[:, part] = np.hypot(unseen, taken_off[:, part])
     return Believed(believed, sigmas, taken_off, holes)
 
@@ -77,29 +79,35 @@ def believed_motion(stamps_ns: NDArray[np.int64], twists: Array, expected: Expec
 def holes_between(stamps_ns: NDArray[np.int64], longest_s: float) -> Array:
     """Return how much longer than usual each of the N intervals between N + 1 stamps is, s; mostly 0."""
     seconds = np.diff(stamps_ns) * 1e-9
-    usual = np.r_[0.0, _running_percentile(seconds, _MOSTLY)[1:]]  # of one alone it is not known
+    usual = _running_percentile(seconds, _MOSTLY, unknown=1)
     return np.maximum(0.0, seconds - np.maximum(longest_s, _LONG * usual))
 
 
-def _running_percentile(values: Array, percentile: float) -> Array:
-    """Return the percentile of each value and those before it, as far back as is remembered."""
+def _running_percentile(values: Array, percentile: float, unknown: int) -> Array:
+    """Return the percentile of each value and those before it, as far back as is remembered; 0 for the first ones."""
     found = percentile_filter(values, percentile, _REMEMBERED, mode="nearest", origin=_REMEMBERED // 2)
     for k in range(min(len(values), _REMEMBERED)):
         found[k] = np.percentile(values[: k + 1], percentile)
+    found[:unknown] = 0.0
     return np.asarray(found)
 
 
-def _hold(twists: Array, limits: Array, off: NDArray[np.bool_]) -> Array:
-    """Keep twists (N, 3) within the limits of the ones before, in place; return by how much they were beyond."""
+def _hold(twists: Array, before: Array, limits: Array, off: NDArray[np.bool_]) -> Array:
+    """Keep twists (N, 3) within the limits of the ones before, in place; return by how much they were beyond.
+
+    before (3,) is that before the first; off tells which are beyond the limits of the ones before as measured.
+    """
     beyond = np.zeros(len(twists))
-    for first in np.flatnonzero(off):
-        for k in range(int(first), len(twists)):
-            difference = twists[k] - twists[k - 1]
-            size = float(np.linalg.norm(difference))
-            if size <= limits[k]:
-                break
+    for k in range(len(twists)):
+        if not off[k] and (k == 0 or beyond[k - 1] == 0.0):
+            continue
+        last = twists[k - 1] if k else before
+        slowed = last * np.clip(twists[k] @ last / max(float(last @ last), 1e-12), 0.0, 1.0)
+        difference = twists[k] - slowed
+        size = float(np.linalg.norm(difference))
+        if size > limits[k]:
             beyond[k] = size - limits[k]
-            twists[k] = twists[k - 1] + difference * (limits[k] / size)
+            twists[k] = slowed + difference * (limits[k] / size)
     return beyond
 
 
