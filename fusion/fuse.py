@@ -112,9 +112,19 @@ def loop_columns(problem: Problem) -> tuple[Columns, Rows]:
 
 def never_started(problem: Problem, options: FuseOptions) -> InputError:
     """Return the error of a filter whose start's conditions were never met."""
+    begin, poses = options.start, problem.measurements.stamps_ns[problem.measurements.kinds != ODOMETRY_STEP]
+    file = "T_odom_cam.tum" if problem.motion == "odometry" else "imu.csv"
+    span = problem.imu.stamps_ns if len(problem.imu) else poses[:0]
+    inside = np.count_nonzero((poses >= span[0]) & (poses <= span[-1])) if len(span) else 0
+    if inside < begin.min_votes <= len(poses):
+        return InputError(
+            f"the filter never started: {inside} of {len(poses)} poses lie between its first and last stamp",
+            path=problem.path / file,
+            fix="put both on one clock (poet-loc check tells what they cover), or choose another --motion",
+        )
     return InputError(
-        f"the filter never started: no {options.start.min_votes} poses within "
-        f"{options.start.window_s} s agree with each other and with gravity",
+        f"the filter never started: no {begin.min_votes} poses within {begin.window_s} s agree with each other"
+        + {"odometry": " and with the odometry", "constant-velocity": ""}.get(problem.motion, " and with gravity"),
         path=problem.path,
         fix="check the map and the extrinsics, relax --start, or give --start.pose",
     )

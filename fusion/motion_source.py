@@ -13,7 +13,6 @@ from fusion.measurements import BEFORE_POSES, ODOMETRY_STEP, Measurements
 from fusion.odometry import believed_samples, odometry_samples
 from fusion.options import FuseOptions
 from poet_loc.core.input_error import InputError
-from poet_loc.core.odometry_breaks import holes_between
 from poet_loc.core.records import Calibration, ImuNoise, ImuSamples
 from poet_loc.core.trajectory import Trajectory
 from poet_loc.io.log_folder import Log
@@ -51,9 +50,9 @@ def motion_source(
         return _imu(log, calibration, options)
     body: Literal["imu", "cam"] = "cam" if calibration.T_cam_imu is None else "imu"
     if kind == "odometry":
-        T_odom_cam = _held(_on_imu_clock(_odometry_of(log), calibration), stamps_ns, options.gap.longest_s)
+        T_odom_cam = _on_imu_clock(_odometry_of(log), calibration)
         T_cam_body = RigidTransform.identity() if calibration.T_cam_imu is None else calibration.T_cam_imu
-        samples, doubts = believed_samples(odometry_samples(T_odom_cam, T_cam_body), options)
+        samples, doubts = believed_samples(odometry_samples(T_odom_cam, T_cam_body), stamps_ns, options)
         return MotionSource("odometry", samples, ImuNoise(0.0, 0.0, 0.0, 0.0, 0.0), body, doubts)
     return MotionSource("constant-velocity", _nothing_measured(stamps_ns, options), _smooth(options), body)
 
@@ -109,19 +108,6 @@ def _odometry_of(log: Log) -> Trajectory:
 
 def _on_imu_clock(T_odom_cam: Trajectory, calibration: Calibration) -> Trajectory:
     return replace(T_odom_cam, stamps_ns=T_odom_cam.stamps_ns + round(calibration.timeshift_cam_imu_s * 1e9))
-
-
-def _held(T_odom_cam: Trajectory, stamps_ns: NDArray[np.int64], longest_s: float) -> Trajectory:
-    """Return odometry that stands still from the first measurement and to the last, where that is a hole.
-
-    That it stood still nobody believes (`odometry.believed_samples`).
-    """
-    stamps, poses = T_odom_cam.stamps_ns, T_odom_cam.T_world_body
-    if len(stamps_ns) and stamps[0] - stamps_ns[0] > 1e9 * longest_s:
-        stamps, poses = np.r_[stamps_ns[0], stamps], RigidTransform.concatenate([poses[0], poses])
-    if len(stamps_ns) and holes_between(np.r_[stamps, max(stamps_ns[-1], stamps[-1])], longest_s)[-1] > 0.0:
-        stamps, poses = np.r_[stamps, stamps_ns[-1]], RigidTransform.concatenate([poses, poses[-1]])
-    return Trajectory(stamps, poses)
 
 
 def _imu(log: Log, calibration: Calibration, options: FuseOptions) -> MotionSource:

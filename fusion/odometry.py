@@ -7,6 +7,7 @@ the exponential of that part: R <- R Exp(w dt), p <- p + R J_l(w dt) v dt. Its e
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.spatial.transform import RigidTransform
 
 from fusion.compiled import njit
@@ -14,7 +15,7 @@ from fusion.nav_state import N_ERROR, POSITION, POSITION_ERROR, VELOCITY, Array,
 from fusion.options import FuseOptions
 from fusion.so3_kernels import apply, exp_so3, left_jacobian, multiply, orthonormalise, times_skew
 from poet_loc.core.geometry import local
-from poet_loc.core.odometry_breaks import Expected, believed_motion
+from poet_loc.core.odometry_breaks import Expected, believed_motion, holes_between, unseen_sigmas
 from poet_loc.core.records import ImuSamples
 from poet_loc.core.trajectory import Trajectory
 
@@ -46,14 +47,29 @@ def expected_of(options: FuseOptions) -> Expected:
     return Expected(drift, gap.longest_s, (gap.angular_rate, gap.speed))
 
 
-def believed_samples(samples: ImuSamples, options: FuseOptions) -> tuple[ImuSamples, Array]:
-    """Return what to believe of `odometry_samples`, and the variances (N, 2) per second of what is not known of it."""
-    twists = np.hstack([samples.angular_velocity, samples.specific_force])
-    found = believed_motion(samples.stamps_ns, twists[:-1], expected_of(options))
-    doubts = found.sigmas**2 / (np.diff(samples.stamps_ns)[:, None] * 1e-9)
-    believed = np.vstack([found.twists, found.twists[-1:]])
-    kept = np.ascontiguousarray(believed[:, :3]), np.ascontiguousarray(believed[:, 3:])
-    return ImuSamples(samples.stamps_ns, *kept), np.vstack([doubts, doubts[-1:]])
+def believed_samples(
+    samples: ImuSamples, stamps_ns: NDArray[np.int64], options: FuseOptions
+) -> tuple[ImuSamples, Array]:
+    """Return what to believe of `odometry_samples`, and the variances (N, 2) per second of what is not known of it.
+
+    Where measurements of stamps_ns lie in holes before and behind it, the body stands still, which nobody believes.
+    """
+    stamps, expected = samples.stamps_ns, expected_of(options)
+    twists = np.hstack([samples.angular_velocity, samples.specific_force])[:-1]
+    found = believed_motion(stamps, twists, expected)
+    twists, sigmas = found.twists, found.sigmas
+    first, last = (stamps_ns[0], stamps_ns[-1]) if len(stamps_ns) else (stamps[0], stamps[-1])
+    behind = holes_between(np.r_[stamps, max(last, stamps[-1])], expected.longest_s)[-1:]
+    if behind[0] > 0.0:
+        stamps, twists = np.r_[stamps, last], np.vstack([twists, np.zeros(6)])
+        sigmas = np.vstack([sigmas, unseen_sigmas(behind, expected)])
+    before = np.array([(stamps[0] - first) * 1e-9 - expected.longest_s])
+    if before[0] > 0.0:
+        stamps, twists = np.r_[first, stamps], np.vstack([np.zeros(6), twists])
+        sigmas = np.vstack([unseen_sigmas(before, expected), sigmas])
+    doubts, twists = sigmas**2 / (np.diff(stamps)[:, None] * 1e-9), np.vstack([twists, twists[-1:]])
+    kept = np.ascontiguousarray(twists[:, :3]), np.ascontiguousarray(twists[:, 3:])
+    return ImuSamples(stamps, *kept), np.vstack([doubts, doubts[-1:]])
 
 
 @njit(cache=True)

@@ -19,7 +19,7 @@ Array = NDArray[np.float64]
 
 FAR = 5.0
 """A twist is off where it differs so many times more from the one before than they mostly do."""
-_LONG, _MOSTLY = 3.0, 90.0  # times the interval that so many in a hundred keep within make a hole
+_LONG, _MOSTLY = 3.0, 90  # times the interval that so many in a hundred keep within make a hole
 _REMEMBERED = 31  # intervals that say what is usual, odd
 _TOLD, _TOLD_S = (np.radians(5.0), 0.05), 0.5  # rad and m of a jump, s of a hole, that are worth telling
 _CORRELATED_S = 1.0  # for so long a motion goes one way; then it wanders
@@ -60,36 +60,38 @@ def believed_motion(stamps_ns: NDArray[np.int64], twists: Array, expected: Expec
     """
     seconds = np.diff(stamps_ns) * 1e-9
     holes = holes_between(stamps_ns, expected.longest_s)
-    believed, sigmas, taken_off = twists.copy(), np.empty((len(twists), 2)), np.zeros((len(twists), 2))
+    believed, unseen, taken_off = twists.copy(), unseen_sigmas(holes, expected), np.zeros((len(twists), 2))
     for part in range(2):
         own = believed[:, 3 * part : 3 * part + 3]
-        unseen = expected.unseen[part] * np.sqrt(holes * np.minimum(holes, _CORRELATED_S))
-        loose = unseen / seconds
+        loose = unseen[:, part] / seconds
         before = own[[np.argmin(np.linalg.norm(own[:2], axis=1))]]
         differences = np.linalg.norm(np.diff(own, axis=0, prepend=before), axis=1)
         moved = expected.unseen[part] * np.minimum(seconds - holes, _CORRELATED_S)
         least = np.hypot(np.sqrt(6.0 / seconds) * expected.walk[part], moved)  # drift of both, and a change of motion
-        usual = np.maximum(_running_percentile(differences, 50.0, unknown=2), least)
+        usual = np.maximum(_running_percentile(differences, 50), least)
         limits = FAR * usual + loose + np.r_[0.0, loose[:-1]]
         taken_off[:, part] = _hold(own, before[0], limits, differences > limits) * seconds
-        sigmas[:, part] = np.hypot(unseen, taken_off[:, part])
-    return Believed(believed, sigmas, taken_off, holes)
+    return Believed(believed, np.hypot(unseen, taken_off), taken_off, holes)
+
+
+def unseen_sigmas(holes_s: Array, expected: Expected) -> Array:
+    """Return the 1-sigma (N, 2) per axis, rad and m, of what a camera may have done in holes (N,) of so many s."""
+    return np.sqrt(holes_s * np.minimum(holes_s, _CORRELATED_S))[:, None] * expected.unseen
 
 
 def holes_between(stamps_ns: NDArray[np.int64], longest_s: float) -> Array:
     """Return how much longer than usual each of the N intervals between N + 1 stamps is, s; mostly 0."""
     seconds = np.diff(stamps_ns) * 1e-9
-    usual = _running_percentile(seconds, _MOSTLY, unknown=1)
+    usual = _running_percentile(seconds, _MOSTLY)
     return np.maximum(0.0, seconds - np.maximum(longest_s, _LONG * usual))
 
 
-def _running_percentile(values: Array, percentile: float, unknown: int) -> Array:
-    """Return the percentile of each value and those before it, as far back as is remembered; 0 for the first ones."""
-    found = percentile_filter(values, percentile, _REMEMBERED, mode="nearest", origin=_REMEMBERED // 2)
+def _running_percentile(values: Array, percentile: int) -> Array:
+    """Return the percentile of each value and those before it, as far back as is remembered; 0 for the first, alone."""
+    found = np.asarray(percentile_filter(values, percentile, _REMEMBERED, mode="nearest", origin=_REMEMBERED // 2))
     for k in range(min(len(values), _REMEMBERED)):
-        found[k] = np.percentile(values[: k + 1], percentile)
-    found[:unknown] = 0.0
-    return np.asarray(found)
+        found[k] = np.percentile(values[: k + 1], percentile, method="lower") if k else 0.0
+    return found
 
 
 def _hold(twists: Array, before: Array, limits: Array, off: NDArray[np.bool_]) -> Array:

@@ -24,6 +24,7 @@ from fusion.prepare import pose_problem
 from fusion.result import FuseResult
 from fusion.simulate import SimulationOptions, simulate
 from poet_loc.core.geometry import make_pose
+from poet_loc.core.input_error import InputError
 from poet_loc.core.trajectory import Trajectory
 from poet_loc.io.log_folder import Log
 
@@ -188,6 +189,29 @@ def test_odometry_that_begins_late_and_ends_early_leaves_the_rest_to_the_detecti
         assert position[later].max() < 0.1
         assert angle[later].max() < 6.0
         assert nees[later].max() < 6.0
+
+
+@pytest.mark.parametrize("kept", [slice(0, 2), slice(0, 3), slice(150, 152), slice(-2, None)])
+def test_a_few_poses_of_odometry_leave_all_else_to_the_detections(log, kept):
+    """What lies before and behind them is no measure of how long its intervals usually are."""
+    result = fuse(replace(log, T_odom_cam=log.T_odom_cam[kept]), ODOMETRY)
+    assert result.stamps_ns[-1] >= log.object_poses[""].stamps_ns[-1]
+    seconds, position, _, nees = errors(result, log)
+    assert seconds[0] < 1.0
+    assert position.max() < 0.12
+    assert nees.mean() < 2.0
+
+
+def test_a_filter_that_never_starts_names_what_is_missing(log):
+    """The IMU where no poses lie in its time; the odometry where it tears all votes apart."""
+    poses = log.object_poses[""]
+    later = replace(log, object_poses={"": replace(poses, stamps_ns=poses.stamps_ns + 10**11)})
+    with pytest.raises(InputError, match=rf"imu\.csv: .* 0 of {len(poses)} poses lie between its"):
+        fuse(later, BOTH)
+    odometry, rng = log.T_odom_cam, np.random.default_rng(0)
+    anywhere = make_pose(Rotation.random(len(odometry), rng=rng), rng.normal(size=(len(odometry), 3)))
+    with pytest.raises(InputError, match="agree with each other and with the odometry"):
+        fuse(replace(log, T_odom_cam=Trajectory(odometry.stamps_ns, anywhere)), ODOMETRY)
 
 
 def test_the_shift_of_the_cameras_clock_is_odometrys_too():
