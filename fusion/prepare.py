@@ -20,7 +20,7 @@ from fusion.measurements import CAMERA_POSE, OBJECT_POSE, Measurements, ray_alig
 from fusion.motion_source import Kind, motion_source, odometry_steps
 from fusion.nav_state import ACCEL_BIAS_ERROR, CORE, GYRO_BIAS_ERROR, VELOCITY_ERROR, StateLayout, nominal_state
 from fusion.options import DetectionBias, FuseOptions
-from fusion.scatter import usual_scatter
+from fusion.scatter import LAST_NS, usual_scatter
 from poet_loc.core.consistency import chi_square_quantile
 from poet_loc.core.input_error import InputError
 from poet_loc.core.records import Calibration, CameraPoses, ImuNoise, ImuSamples, LandmarkMap, ObjectPoses
@@ -209,7 +209,8 @@ def fill_memory(problem: Problem, options: FuseOptions) -> tuple[Array, NDArray[
         _start_at(options.start.pose, options, m)
     m.spread_model[:] = spread_model(options.noise)
     m.usual_scatter[:] = usual_scatter(options.bias) if layout.bias_kinds else 0.0
-    m.scatter[:, :3] = m.usual_scatter
+    m.scatter[:, :3], m.scatter[:, LAST_NS] = m.usual_scatter, -math.inf
+    m.counters[memory.UNSURE_AT] = np.iinfo(np.int64).min
     m.bias_model[:] = _bias_model(options.bias)
     m.moved[: place_watch.MIN_POSES + 1] = _moved(options)
     m.meeting[: meeting.REPLACE + 1] = _meeting(options)

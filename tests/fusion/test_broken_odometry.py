@@ -19,7 +19,7 @@ from fusion.measurements import ODOMETRY_STEP
 from fusion.memory import allocate, views
 from fusion.nav_state import StateLayout
 from fusion.odometry import ROTATION_DOUBT, TRANSLATION_DOUBT
-from fusion.options import FuseOptions, Gap
+from fusion.options import DetectionBias, FuseOptions, Gap
 from fusion.prepare import pose_problem
 from fusion.result import FuseResult
 from fusion.simulate import SimulationOptions, simulate
@@ -189,6 +189,21 @@ def test_odometry_that_begins_late_and_ends_early_leaves_the_rest_to_the_detecti
         assert position[later].max() < 0.1
         assert angle[later].max() < 6.0
         assert nees[later].max() < 6.0
+
+
+@pytest.mark.parametrize("begin_s", [0.1, -5.0, -1000.0])
+def test_where_time_begins_does_not_matter(log, begin_s):
+    """Near zero, over it and before it; also where the filter starts again, and where it follows detections' scatter."""
+
+    def moved(record):
+        return replace(record, stamps_ns=record.stamps_ns + round(begin_s * 1e9) - log.imu.stamps_ns[0])
+
+    spoiled, known = blinded(holed(log, ELSEWHERE), 2.0), DetectionBias(scatter_rotation_deg=1.0, scatter_across=0.002)
+    poses = spoiled.object_poses[""]
+    shifted = replace(spoiled, object_poses={"": moved(poses)}, T_odom_cam=moved(spoiled.T_odom_cam))
+    expected, found = (fuse(each, replace(ODOMETRY, bias=known)) for each in (spoiled, shifted))
+    np.testing.assert_allclose(found.T_world_imu.translation, expected.T_world_imu.translation, atol=1e-9)
+    assert found.restarts == expected.restarts > 0
 
 
 @pytest.mark.parametrize("kept", [slice(0, 2), slice(0, 3), slice(150, 152), slice(-2, None)])
