@@ -193,7 +193,7 @@ def test_odometry_that_begins_late_and_ends_early_leaves_the_rest_to_the_detecti
 
 @pytest.mark.parametrize("begin_s", [0.1, -5.0, -1000.0])
 def test_where_time_begins_does_not_matter(log, begin_s):
-    """Near zero, over it and before it; also where the filter starts again, and where it follows detections' scatter."""
+    """Near zero, over it and before it; also where the filter starts again and where it follows the scatter."""
 
     def moved(record):
         return replace(record, stamps_ns=record.stamps_ns + round(begin_s * 1e9) - log.imu.stamps_ns[0])
