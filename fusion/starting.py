@@ -219,8 +219,11 @@ def _is_contested(m: Memory, w: Work, first: int) -> bool:
 
 @njit(cache=True)
 def try_to_start(m: Memory, w: Work) -> None:
-    """Start at the pose that is given, or where enough votes agree and no other pose has nearly as many."""
-    if m.start[IS_GIVEN] > 0.0:
+    """Start at the pose that is given, or where enough votes agree and no other pose has nearly as many.
+
+    The pose that is given is where the log began, not where a filter that gave up is by now.
+    """
+    if m.start[IS_GIVEN] > 0.0 and m.counters[RESTARTS] == 0:
         _agree_with_given_pose(m, w)
     elif not _found_by_votes(m, w):
         return
