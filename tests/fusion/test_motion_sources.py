@@ -175,10 +175,10 @@ def test_a_guessed_motion_is_given_up_while_nothing_is_seen_and_starts_again(est
     start = Start(pose=(*T.translation[0], *T.rotation.as_quat()[0])) if given else Start()
     result = fuse(log, FuseOptions(estimator=estimator, motion="constant-velocity", start=start))
     seconds = (result.stamps_ns - poses.stamps_ns[0]) * 1e-9
-    assert result.restarts >= 2
+    assert result.restarts == 2
     assert not ((seconds > 5.0) & (seconds < 6.0)).any()
     assert np.sum(result.sigmas[:, :3] ** 2, axis=1).max() < np.pi**2
-    seen = (seconds % 6.0 > 0.5) & (seconds % 6.0 < 3.0)
+    seen = (seconds % 6.0 > 0.2) & (seconds % 6.0 < 3.0)
     truth, _ = log.T_world_imu.interpolate(result.stamps_ns)
     off = np.linalg.norm(result.trajectory.T_world_body.translation - truth.translation, axis=1)
     assert off[seen].max() < 0.08
