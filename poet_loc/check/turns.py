@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from poet_loc.check.finding import Evidence, Finding
@@ -16,6 +17,7 @@ from poet_loc.core.trajectory import Trajectory
 from poet_loc.core.turn_match import Match, correlation_under, match_turns
 from poet_loc.io.log_folder import Log, object_poses_file
 
+Array = NDArray[np.float64]
 Direction = Literal["as is", "inverse"]
 
 _TELLING = 0.45  # correlation from which a source is believed
@@ -53,6 +55,14 @@ class Turning:
     """1 where it is in rad/s."""
     correlation: float
     file: str
+    bias: Array
+    """(3,) rad/s that the gyroscope reads beside those turns."""
+
+    @classmethod
+    def of(cls, match: Match, file: str, factor: float = 1.0) -> Turning:
+        """Take what a match says of a gyroscope that was divided by a factor."""
+        bias = match.gyroscope_mean * factor - match.poses_mean
+        return cls(match.gyroscope_scale * factor, match.correlation, file, bias)
 
     @property
     def in_degrees(self) -> bool:
@@ -83,7 +93,7 @@ def gyroscope_beside_poses(log: Log) -> Turning | None:
             imu = replace(log.imu, angular_velocity=log.imu.angular_velocity / factor)
             match = match_turns(imu, rates)
             if match is not None and match.correlation > max(_FAINT, match.offset.background + _ABOVE_CHANCE):
-                found.append(Turning(match.gyroscope_scale * factor, match.correlation, source.file))
+                found.append(Turning.of(match, source.file, factor))
     return max(found, key=lambda each: each.correlation, default=None)
 
 
@@ -170,7 +180,7 @@ def _gyroscope_unit(compared: _Compared) -> Iterator[Finding]:
     scale = compared.match.gyroscope_scale
     evidence: Evidence = {"gyroscope_over_poses": scale, "against": compared.source.file}
     evidence |= {"correlation": compared.match.correlation}
-    turning = Turning(scale, compared.match.correlation, compared.source.file)
+    turning = Turning.of(compared.match, compared.source.file)
     if turning.in_degrees:
         yield turning.as_degrees()
     elif not 0.6 < scale < 1.7 and compared.match.correlation > 0.8:

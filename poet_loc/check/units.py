@@ -24,7 +24,7 @@ _WINDOW_S = 0.5
 _QUIET = 0.05  # scatter of a quiet window's acceleration, as a share of its mean
 _NORM_TOLERANCE = 0.6
 _LARGEST_BIAS = 0.2
-_FASTEST_TURN, _SLOWEST_TURN = 10.0, 1.0  # below the latter degrees would be a camera that hardly turns
+_FASTEST_TURN = 10.0
 _FASTEST_MOTION = 50.0
 _SCALE_SCATTER = 0.5
 _UNITS = {"g": GRAVITY, "milli-g": GRAVITY / 1e3, "cm/s^2": 0.01, "mm/s^2": 0.001, "ft/s^2": 0.3048}
@@ -67,13 +67,13 @@ def check_gyroscope(log: Log) -> Iterator[Finding]:
     """Yield a gyroscope in degrees or with a large bias.
 
     Degrees are an error where poses turn with it, 57 times slower, and a warning where only its reading at rest or its
-    fastest turn hints at them; no hint counts where poses turn as fast as it does.
+    fastest turn hints at them. What it reads in quiet moments is no bias where the poses turn as much in the mean.
     """
     windows = _windows(log)
     if log.imu is None or windows is None:
         return
     fast = float(np.percentile(np.linalg.norm(log.imu.angular_velocity, axis=1), 95))
-    turning = gyroscope_beside_poses(log) if fast > _SLOWEST_TURN else None
+    turning = gyroscope_beside_poses(log) if fast > _LARGEST_BIAS else None
     if turning is not None and turning.in_degrees:
         yield turning.as_degrees()
         return
@@ -84,7 +84,8 @@ def check_gyroscope(log: Log) -> Iterator[Finding]:
     still = quiet[np.argsort(wobble[quiet])[: max(1, len(quiet) // 10)]]
     bias = np.median(rates[still], axis=0)
     at_rest = float(np.linalg.norm(bias))
-    if at_rest < _LARGEST_BIAS and (fast < _FASTEST_TURN or turning is not None):
+    beside_poses = at_rest if turning is None else float(np.linalg.norm(turning.bias))
+    if min(at_rest, beside_poses) < _LARGEST_BIAS and (fast < _FASTEST_TURN or turning is not None):
         return
     evidence: Evidence = {"norm_at_rest_rad_s": at_rest, "as_degrees_deg_s": at_rest, "p95_rad_s": fast}
     evidence |= {f"{name}_at_rest_rad_s": float(value) for name, value in zip("xyz", bias, strict=True)}

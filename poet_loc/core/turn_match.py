@@ -37,6 +37,10 @@ class Match:
     """(3, 3) that reflection."""
     gyroscope_scale: float
     """Gyroscope over poses: 1 where both are in rad/s."""
+    gyroscope_mean: Array
+    """(3,) its mean rate over those turns .."""
+    poses_mean: Array
+    """.. and theirs in its axes, rad/s: the difference is its bias."""
     samples: int
 
     @property
@@ -63,6 +67,7 @@ def match_turns(imu: ImuSamples, rates: TurnRates) -> Match | None:
     if offset is None:
         return None
     cross, scale = _cross_covariance(gyroscope, rates, offset.offset_s)
+    turned = gyroscope.mean_rate(rates, offset.offset_s)
     (score,), (rotation,) = best_rotation(cross[None])
     u, _, vt = np.linalg.svd(cross)
     reflection = u @ np.diag([1.0, 1.0, -np.sign(np.linalg.det(u @ vt))]) @ vt
@@ -73,6 +78,8 @@ def match_turns(imu: ImuSamples, rates: TurnRates) -> Match | None:
         mirrored=float(np.trace(reflection.T @ cross) / scale),
         reflection=reflection,
         gyroscope_scale=_scale(gyroscope, rates, offset.offset_s, rotation),
+        gyroscope_mean=np.nanmean(turned, axis=0),
+        poses_mean=np.mean(rates.rates[~np.isnan(turned[:, 0])] @ rotation.T, axis=0),
         samples=len(rates),
     )
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -13,6 +14,7 @@ from poet_loc.check.turns import gyroscope_beside_poses
 from poet_loc.check.units import check_gyroscope
 from poet_loc.core.geometry import make_pose
 from poet_loc.core.records import ImuSamples
+from poet_loc.core.trajectory import Trajectory
 from poet_loc.io.log_folder import Log, read_log
 
 DEGREES = float(np.degrees(1.0))
@@ -62,6 +64,31 @@ def test_without_poses_that_turn_with_it_degrees_are_a_warning(fast):
     order = np.random.default_rng(0).permutation(len(poses))  # poses that belong to other stamps
     elsewhere = replace(poses, T_cam_obj=poses.T_cam_obj[order])
     assert gyroscope_beside_poses(replace(fast, object_poses={"": elsewhere})) is None
+
+
+def never_at_rest(bias: float, slowest: float = 0.15) -> Log:
+    """A camera 7 times a second that swings slowly all the time: its quietest moments are no rest."""
+    seconds, seen_s = np.arange(0.0, 30.0, 0.01), np.arange(0.0, 30.0, 1.0 / 7.0)
+
+    def rotation(t: np.ndarray) -> Rotation:
+        angles = [0.5 * np.sin(0.5 * t), slowest * t + 0.2 * np.sin(0.9 * t), 0.25 * t]
+        return Rotation.from_euler("ZYX", np.stack(angles, axis=-1))
+
+    rates = (rotation(seconds - 1e-4).inv() * rotation(seconds + 1e-4)).as_rotvec() / 2e-4
+    force = rotation(seconds).inv().apply([0.0, 0.0, 9.81])
+    body = make_pose(rotation(seen_s), np.zeros((len(seen_s), 3)))
+    imu = ImuSamples(np.round(seconds * 1e9).astype(np.int64), rates + bias * np.array([1.0, 0.0, 0.0]), force)
+    truth = Trajectory(np.round(seen_s * 1e9).astype(np.int64), body)
+    return Log(path=Path("log"), imu=imu, T_world_imu=truth)
+
+
+def test_a_body_that_never_rests_has_no_bias_for_that():
+    steady = never_at_rest(0.0)
+    assert not list(check_gyroscope(steady))
+    (finding,) = check_gyroscope(replace(steady, T_world_imu=None))  # by itself the reading would be one
+    assert "quietest moments" in finding.what
+    (finding,) = check_gyroscope(never_at_rest(0.4))
+    assert (finding.check, finding.severity) == ("gyroscope-bias", "error")
 
 
 @pytest.mark.parametrize("seed", range(4))
