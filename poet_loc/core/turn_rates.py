@@ -92,19 +92,23 @@ def believable(imu: ImuSamples, rates: TurnRates) -> TurnRates:
 
 
 def _pairs(stamps_ns: Stamps, groups: NDArray[np.int64]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """Return the rows at the ends of each turn: of one body, and apart by the multiple of its interval that fits."""
     order = np.lexsort((stamps_ns, groups))
-    stamps, frames = stamps_ns[order], np.unique(stamps_ns)
-    if len(frames) < 2:
+    stamps, change = stamps_ns[order], np.diff(groups[order]) != 0
+    between = np.diff(stamps)[~change]
+    if not (between > 0).any():
         return order[:0], order[:0]
-    interval = float(np.median(np.diff(frames))) / 1e9
+    interval = float(np.median(between[between > 0])) / 1e9
     wanted = max(_BASELINE_S, interval)
-    step = max(1, round(wanted / interval))
-    first, second = order[:-step], order[step:]
-    apart = (stamps[step:] - stamps[:-step]) / 1e9
-    good = (groups[first] == groups[second]) & (apart > 0) & (apart < min(2.0 * wanted, _LONGEST_S))
+    bodies = np.r_[0, np.cumsum(change)]
+    line = bodies * (np.ptp(stamps) + round(_LONGEST_S * 1e9)) + stamps - stamps.min()  # one body behind the other
+    second = np.searchsorted(line, line + round((wanted - 0.5 * interval) * 1e9))
+    first = np.flatnonzero(second < len(line))
+    first = first[line[second[first]] - line[first] < min(2.0 * wanted, _LONGEST_S) * 1e9]
+    frames = np.unique(stamps)
     if len(frames) > _MOST_STAMPS:
-        good &= np.searchsorted(frames, stamps[:-step]) % -(-len(frames) // _MOST_STAMPS) == 0
-    return first[good], second[good]
+        first = first[np.searchsorted(frames, stamps[first]) % -(-len(frames) // _MOST_STAMPS) == 0]
+    return order[first], order[second[first]]
 
 
 def _medians(values: Array, row: NDArray[np.int64], count: int) -> Array:
