@@ -45,9 +45,11 @@ def usual_scatter(bias: DetectionBias) -> Array:
 def scatter_of(stamps: Stamps, errors: Array) -> Array:
     """Return the scatter (3,) of an object's errors (N, 6) in a log, as a filter would find it in the end.
 
-    Errors are [rotation (rad), across x, across y, along], places as shares of the distance. NaN without a step.
+    Errors are [rotation (rad), across x, across y, along], places as shares of the distance, in order of time; of one
+    stamp the first counts. NaN without a step.
     """
-    steps = np.diff(errors, axis=0)[np.diff(stamps) < LONGEST_STEP_S * 1e9]
+    stamps, first = np.unique(stamps, return_index=True)
+    steps = np.diff(errors[first], axis=0)[np.diff(stamps) < LONGEST_STEP_S * 1e9]
     if len(steps) == 0:
         return np.full(3, np.nan)
     halves = (steps[:, :3], steps[:, 3:5], steps[:, 5:])

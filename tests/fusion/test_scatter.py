@@ -43,6 +43,12 @@ def test_flips_hardly_change_it_and_far_apart_detections_say_nothing():
     assert np.isnan(scatter_of(10 * STAMPS, errors)).all()
 
 
+def test_of_two_detections_of_an_object_in_one_frame_the_first_counts():
+    errors = TIMES * np.random.default_rng(0).standard_normal((4000, 6))
+    twice = np.stack([errors, errors + 1.0], axis=1).reshape(-1, 6)
+    np.testing.assert_array_equal(scatter_of(np.repeat(STAMPS, 2), twice), scatter_of(STAMPS, errors))
+
+
 def test_the_filter_finds_the_scatter_that_the_errors_have():
     log = differing(0, False)
     problem, options = pose_problem(log, FuseOptions()), FuseOptions(bias=KNOWN)
