@@ -86,7 +86,7 @@ def pose_problem(
         if log.landmark_map is None:
             raise InputError("there is no landmarks.json", path=log.path, fix="fuse camera poses instead")
         detections = object_poses if object_poses is not None else log.detections(None)[1]
-        measured = object_measurements(detections, log.landmark_map, calibration, options)
+        measured = object_measurements(detections, log.landmark_map, calibration, options, log.path)
     source = motion_source(log, calibration, options, measured.stamps_ns)
     if source.kind == "imu+odometry":
         layout = replace(layout, clone=True)
@@ -113,14 +113,25 @@ def landmark_of_detection(poses: ObjectPoses, landmark_map: LandmarkMap) -> NDAr
 
 
 def object_measurements(
-    poses: ObjectPoses, landmark_map: LandmarkMap, calibration: Calibration, options: FuseOptions
+    poses: ObjectPoses,
+    landmark_map: LandmarkMap,
+    calibration: Calibration,
+    options: FuseOptions,
+    path: Path | None = None,
 ) -> Measurements:
     """Return the detections that belong to a landmark, by stamp and landmark, with default noise where they bring none.
 
-    A detection in or behind the image plane (real networks write those when they fail) is left out.
+    A detection in or behind the image plane (real networks write those when they fail) is left out. Raises InputError,
+    with the log's path, where none is left.
     """
     landmark = landmark_of_detection(poses, landmark_map)
     usable = (landmark >= 0) & (poses.T_cam_obj.translation[:, 2] > NEAREST_OBJECT)
+    if not usable.any():
+        raise InputError(
+            f"none of {len(poses)} detections is of an object of the map and in front of the camera",
+            path=path,
+            fix="z of T_cam_obj points forward, in metres; object ids are those of landmarks.json",
+        )
     poses, landmark = poses[usable], landmark[usable]
     order = np.lexsort((landmark, poses.stamps_ns))
     poses, landmark = poses[order], landmark[order]

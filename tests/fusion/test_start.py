@@ -15,6 +15,7 @@ from fusion.fuse import fuse
 from fusion.options import DetectionBias, FuseOptions
 from fusion.prepare import pose_problem
 from fusion.simulate import SimulationOptions, simulate
+from poet_loc.core.geometry import make_pose
 from poet_loc.core.input_error import InputError
 from poet_loc.core.records import LandmarkMap, Symmetry
 from poet_loc.io.log_folder import Log
@@ -230,3 +231,13 @@ def test_compiled_is_plain_and_shuffled_is_in_order(log, given):
     for event in shuffled(problem, 0.3, np.random.default_rng(0)):
         feed(estimator, problem, event)
     assert_ends_like(estimator, problem, options)
+
+
+@pytest.mark.parametrize("motion", ["imu", "odometry", "imu+odometry", "constant-velocity"])
+def test_detections_none_of_which_can_be_used_are_told(motion):
+    log = simulate(SimulationOptions(duration_s=2.0, objects=3, odometry=True))
+    poses = log.object_poses[""]
+    behind = make_pose(poses.T_cam_obj.rotation, poses.T_cam_obj.translation * [1.0, 1.0, -1.0])
+    for useless in (poses[:0], replace(poses, T_cam_obj=behind), replace(poses, object_ids=poses.object_ids + 100)):
+        with pytest.raises(InputError, match=f"none of {len(useless)} detections"):
+            fuse(replace(log, object_poses={"": useless}), FuseOptions(motion=motion))
