@@ -126,7 +126,7 @@ def never_started(problem: Problem, options: FuseOptions) -> InputError:
         f"the filter never started: no {begin.min_votes} poses within {begin.window_s} s agree with each other"
         + {"odometry": " and with the odometry", "constant-velocity": ""}.get(problem.motion, " and with gravity"),
         path=problem.path,
-        fix="check the map and the extrinsics, relax --start, or give --start.pose",
+        fix="see what poet-loc check says of the log, relax --start, or give --start.pose",
     )
 
 

@@ -19,8 +19,9 @@ from poet_loc.check.objects import (
 from poet_loc.check.odometry import check_odometry
 from poet_loc.check.reading import read_what_there_is
 from poet_loc.check.stamps import check_rate, check_spans, check_stamps
-from poet_loc.check.turns import check_turns
+from poet_loc.check.turns import check_turns, unreadable_calibration
 from poet_loc.check.units import check_accelerometer, check_gyroscope, check_lengths
+from poet_loc.core.records import Calibration
 from poet_loc.io.log_folder import Log, object_poses_file, write_log
 from poet_loc.io.whole_folder import whole_folder
 
@@ -79,10 +80,24 @@ def write_repaired(diagnosis: Diagnosis, out: str | Path, overwrite: bool = Fals
 
 
 def _missing(log: Log) -> list[Finding]:
+    return [*_nothing_seen(log), *_uncalibrated(log)]
+
+
+def _nothing_seen(log: Log) -> Iterator[Finding]:
     if log.camera_poses is not None or (log.object_poses and log.landmark_map is not None):
-        return []
+        return
     file = "landmarks.json" if log.object_poses else object_poses_file("")
-    if (log.path / file).exists():
-        return []  # it cannot be read, which is told already
-    fix = "a log holds object_poses.csv with landmarks.json, or camera_poses.csv"
-    return [Finding("missing", "error", file, "is not there: nothing can be localised", fix)]
+    if not (log.path / file).exists():  # one that cannot be read is told already
+        fix = "a log holds object_poses.csv with landmarks.json, or camera_poses.csv"
+        yield Finding("missing", "error", file, "is not there: nothing can be localised", fix)
+
+
+def _uncalibrated(log: Log) -> Iterator[Finding]:
+    if log.imu is None or unreadable_calibration(log):
+        return
+    known = log.calibration or Calibration()
+    keys = {"cam0: T_cam_imu": known.T_cam_imu, "imu0: its noise densities": known.imu}
+    lacking = ", ".join(key for key, value in keys.items() if value is None)
+    if lacking:
+        fix = "add them as Kalibr's camchain and imu.yaml have them (docs/formats.md)"
+        yield Finding("missing", "error", "calibration.yaml", f"the IMU cannot be fused without {lacking}", fix)

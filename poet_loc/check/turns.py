@@ -257,7 +257,14 @@ def _rotation_off(compared: list[_Compared], R_cam_imu: Rotation) -> Iterator[Fi
     yield Finding("extrinsics-rotation", "error", "calibration.yaml", what, fix, evidence)
 
 
+def unreadable_calibration(log: Log) -> bool:
+    """Whether calibration.yaml is there and holds nothing that could be read: what it states is not known."""
+    return log.calibration is None and (log.path / "calibration.yaml").exists()
+
+
 def _offsets(log: Log, compared: list[_Compared]) -> Iterator[Finding]:
+    if unreadable_calibration(log):
+        compared = [each for each in compared if each.source.body == "imu"]
     stated = log.calibration.timeshift_cam_imu_s if log.calibration else 0.0
     late = []
     for each in compared:
@@ -270,7 +277,7 @@ def _offsets(log: Log, compared: list[_Compared]) -> Iterator[Finding]:
     for each, off in late:
         shared = agree and each.source.body == "cam"
         if not shared or each is best:
-            yield _offset_finding(each, off, stated, shared and log.calibration is not None)
+            yield _offset_finding(each, off, stated, shared)
 
 
 def _agree(best: _Compared, other: _Compared) -> bool:

@@ -25,6 +25,7 @@ _QUIET = 0.05  # scatter of a quiet window's acceleration, as a share of its mea
 _NORM_TOLERANCE = 0.6
 _LARGEST_BIAS = 0.2
 _FASTEST_TURN = 10.0
+_MOMENTS = 4  # at least so many quiet windows
 _FASTEST_MOTION = 50.0
 _SCALE_SCATTER = 0.5
 _UNITS = {"g": GRAVITY, "milli-g": GRAVITY / 1e3, "cm/s^2": 0.01, "mm/s^2": 0.001, "ft/s^2": 0.3048}
@@ -81,9 +82,11 @@ def check_gyroscope(log: Log) -> Iterator[Finding]:
     quiet = np.flatnonzero(scatter / np.maximum(np.linalg.norm(means, axis=1), 1e-9) < _QUIET)
     if not quiet.size:
         return
-    still = quiet[np.argsort(wobble[quiet])[: max(1, len(quiet) // 10)]]
+    still = quiet[np.argsort(wobble[quiet])[: max(_MOMENTS, len(quiet) // 10)]]
     bias = np.median(rates[still], axis=0)
     at_rest = float(np.linalg.norm(bias))
+    if np.linalg.norm(rates[still].std(axis=0)) > 0.5 * at_rest and fast < _FASTEST_TURN:
+        return  # at rest it would read the same each time: this one moved
     beside_poses = at_rest if turning is None else float(np.linalg.norm(turning.bias))
     if min(at_rest, beside_poses) < _LARGEST_BIAS and (fast < _FASTEST_TURN or turning is not None):
         return

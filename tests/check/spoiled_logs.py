@@ -265,6 +265,11 @@ def millimetre_lever(folder: Path) -> None:
     file.write_text(yaml.safe_dump(content))
 
 
+def renamed_camera(folder: Path) -> None:
+    file = folder / "calibration.yaml"
+    file.write_text(file.read_text().replace("cam0:", "camera:"))
+
+
 def broken_json(folder: Path) -> None:
     (folder / "landmarks.json").write_text('{"landmarks": [')
 
@@ -328,6 +333,9 @@ SPOILED_FILES: dict[str, tuple[SpoilFolder, set[str], bool]] = {
     "quaternions of norm 2": (lines("object_poses.csv", long_quaternions), {"quaternion-norm"}, True),
     "lever arm in millimetres": (millimetre_lever, {"millimetres"}, True),
     "no map": (lambda folder: (folder / "landmarks.json").unlink(), {"missing"}, False),
+    "no calibration": (lambda folder: (folder / "calibration.yaml").unlink(), {"missing"}, False),
+    "calibration of another name": (renamed_camera, {"missing"}, False),
+    "calibration no yaml": (lambda folder: (folder / "calibration.yaml").write_text("cam0: ["), {"unreadable"}, False),
     "map no json": (broken_json, {"unreadable"}, False),
 }
 

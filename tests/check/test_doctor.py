@@ -129,6 +129,19 @@ def test_a_detector_that_barely_turns_with_the_gyroscope_is_not_called_late(good
     assert "time-offset" not in names(diagnose(tmp_path).findings)
 
 
+def test_a_calibration_that_cannot_be_read_states_no_time_offset(tmp_path) -> None:
+    """The camera is not called early by what the unreadable file says of it."""
+    write_log(tmp_path, simulate(SimulationOptions(duration_s=12.0, noise="white", timeshift_cam_imu_s=0.2)))
+    file = tmp_path / "calibration.yaml"
+    text = file.read_text()
+    file.write_text(text.replace("gyroscope_noise_density: ", "gyroscope_noise_density: -"))
+    assert names(diagnose(tmp_path).findings) == {"unreadable"}
+    file.unlink()
+    findings = {finding.check: finding for finding in diagnose(tmp_path).findings}
+    assert findings.keys() == {"missing", "time-offset"}
+    assert "set timeshift_cam_imu: 0.2" in findings["time-offset"].fix
+
+
 def test_the_command(good_log, tmp_path, capsys) -> None:
     write_log(tmp_path, good_log)
     assert main(["check", str(tmp_path)]) == 0
