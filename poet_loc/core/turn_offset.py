@@ -21,6 +21,7 @@ Array = NDArray[np.float64]
 
 SEARCH_S = 2.0
 """Offsets are looked for so far either way."""
+_BEYOND_S = 1.0  # an offset further off, whose correlation reaches inside, is seen for so far
 _GRID_S = 0.02
 _APART_S = 0.3  # an offset so far off is a rival
 _FURTHEST_S, _SETTLED_S = 0.1, 1e-4
@@ -178,7 +179,7 @@ def best_rotation(cross: Array) -> tuple[Array, Array]:
 def _correlations(gyroscope: GyroscopeIntegral, rates: TurnRates) -> tuple[Array, Array]:
     """Return lags (K,) s and the correlation at each (K,), all at once by FFT; -1 where too few turns overlap."""
     length = float(np.median(rates.end_ns - rates.start_ns)) / 1e9
-    margin = round(SEARCH_S / _GRID_S)
+    margin = round((SEARCH_S + _BEYOND_S) / _GRID_S)
     lags = np.arange(-margin, margin + 1)
     count = max(int((gyroscope.seconds[-1] - length) / _GRID_S) + 1, 1)
     begin = np.asarray(_GRID_S * np.arange(count), dtype=np.float64)
