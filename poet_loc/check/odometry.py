@@ -7,7 +7,7 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 
 from poet_loc.check.finding import Evidence, Finding
-from poet_loc.core.odometry_breaks import Break, Expected, odometry_breaks
+from poet_loc.core.odometry_breaks import Break, Expected, hole_between, odometry_breaks
 from poet_loc.io.log_folder import Log
 
 EXPECTED = Expected((float(np.radians(0.25)), 0.005), 0.1, (0.5, 0.3))
@@ -16,18 +16,27 @@ EXPECTED = Expected((float(np.radians(0.25)), 0.005), 0.1, (0.5, 0.3))
 
 def check_odometry(log: Log) -> Iterator[Finding]:
     """Yield jumps and holes of T_odom_cam.tum, each kind once with where its worst is."""
-    if log.T_odom_cam is None:
-        return
-    breaks = odometry_breaks(log.T_odom_cam, EXPECTED)
+    breaks = breaks_of(log, EXPECTED)
     jumps, holes = [each for each in breaks if not each.hole], [each for each in breaks if each.hole]
     if jumps:
         what = "the odometry jumps: it relocalised or closed a loop"
         fix = "write the odometry as it was tracked, not as it was corrected; fusion takes such jumps off"
         yield _finding("odometry-jump", what, fix, jumps, max(jumps, key=_size))
     if holes:
-        what = "the odometry has holes: its tracking was lost"
+        what = "the odometry has holes, begins late or ends early: its tracking was lost"
         fix = "see whether the camera was covered, blurred or too fast; fusion does not know how it moved meanwhile"
         yield _finding("odometry-hole", what, fix, holes, max(holes, key=lambda each: each.seconds))
+
+
+def breaks_of(log: Log, expected: Expected) -> list[Break]:
+    """Return the breaks of a log's odometry, with what poses there are before and behind it: it is not known either."""
+    odometry, poses = log.T_odom_cam, [*log.object_poses.values(), log.camera_poses]
+    if odometry is None or not len(odometry):
+        return []
+    begin, end = int(odometry.stamps_ns[0]), int(odometry.stamps_ns[-1])
+    first = min([begin, *(int(each.stamps_ns.min()) for each in poses if each)])
+    last = max([end, *(int(each.stamps_ns.max()) for each in poses if each)])
+    return [*hole_between(first, begin), *odometry_breaks(odometry, expected), *hole_between(end, last)]
 
 
 def _size(jump: Break) -> float:

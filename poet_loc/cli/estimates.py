@@ -12,10 +12,10 @@ from fusion.options import FuseOptions
 from fusion.result import FuseResult
 from landmarks.localize import LocalizeOptions, LocalizeResult, localize
 from landmarks.options import MODES, ORACLES, Mode, SolverOptions
+from poet_loc.check.odometry import breaks_of
 from poet_loc.check.units import check_accelerometer, check_gyroscope
 from poet_loc.cli.terminal import Report
 from poet_loc.core.input_error import InputError
-from poet_loc.core.odometry_breaks import odometry_breaks
 from poet_loc.core.records import CameraPoses
 from poet_loc.io.log_folder import Log
 from poet_loc.report.evaluate import Estimate, EvaluateOptions, Evaluation
@@ -140,7 +140,8 @@ def _tell_of_odometry(log: Log, fused: Sequence[FuseResult], options: FuseOption
     """Note where the odometry that was used jumps or has holes."""
     if log.T_odom_cam is None or not any("odometry" in result.motion for result in fused):
         return
-    breaks, begin_ns = odometry_breaks(log.T_odom_cam, expected_of(options)), int(log.T_odom_cam.stamps_ns[0])
+    breaks = breaks_of(log, expected_of(options))
+    begin_ns = min([int(log.T_odom_cam.stamps_ns[0]), *(each.after_ns for each in breaks)])
     told = ", ".join(f"{each.text} at {(each.after_ns - begin_ns) * 1e-9:.1f} s" for each in breaks[:_TOLD_BREAKS])
     if breaks:
         more = f" and {len(breaks) - _TOLD_BREAKS} more" if len(breaks) > _TOLD_BREAKS else ""

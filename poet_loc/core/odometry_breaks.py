@@ -149,3 +149,9 @@ def odometry_breaks(T_odom_cam: Trajectory, expected: Expected) -> list[Break]:
         Break(int(stamps[k]), float(seconds[k]), bool(holes[k]), float(off[k, 0]), float(off[k, 1]))
         for k in np.flatnonzero(holes | (off > _TOLD).any(axis=1))
     ]
+
+
+def hole_between(start_ns: int, end_ns: int) -> list[Break]:
+    """Return the time in which there is no odometry at all as a hole; none where it is no more than half a second."""
+    seconds = (end_ns - start_ns) * 1e-9
+    return [Break(start_ns, seconds, True, 0.0, 0.0)] if seconds > _TOLD_S else []

@@ -73,6 +73,16 @@ def broken_odometry(length_s: float, jump_m: float) -> SpoilLog:
     return spoil
 
 
+def part_of_odometry(first_s: float, last_s: float) -> SpoilLog:
+    """Add odometry that is the truth, and there from one time to another only."""
+
+    def spoil(log: Log) -> Log:
+        seconds = (log.T_world_cam.stamps_ns - log.T_world_cam.stamps_ns[0]) / 1e9
+        return replace(log, T_odom_cam=log.T_world_cam[(seconds >= first_s) & (seconds <= last_s)])
+
+    return spoil
+
+
 def receive_times(log: Log) -> Log:
     rng = np.random.default_rng(1)
     stamps = np.sort(log.imu.stamps_ns + rng.uniform(-6e6, 6e6, len(log.imu)).astype(np.int64))
@@ -293,6 +303,8 @@ SPOILED_LOGS: dict[str, tuple[SpoilLog, set[str], bool]] = {
     "nothing detected for long": (detection_gap, {"gap"}, False),
     "odometry that jumps": (broken_odometry(0.0, 0.4), {"odometry-jump"}, False),
     "odometry with a hole": (broken_odometry(1.5, 0.0), {"odometry-hole"}, False),
+    "odometry that begins late": (part_of_odometry(2.0, 1e9), {"odometry-hole"}, False),
+    "odometry that ends early": (part_of_odometry(0.0, 5.0), {"odometry-hole"}, False),
     "stamps of receipt": (receive_times, {"jitter"}, False),
     "stamps in microseconds": (microseconds, {"stamp-unit"}, True),
     "imu on another clock": (other_clock, {"span"}, False),

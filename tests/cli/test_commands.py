@@ -386,6 +386,10 @@ def test_fuse_names_where_the_odometry_jumps(tmp_path, capsys):
     assert main(["fuse", str(log), "--out", str(out), "--motion", "odometry", "--no-pictures"]) == 0
     told = " ".join(capsys.readouterr().err.split())
     assert re.search(rf"T_odom_cam.tum has a jump of 0\.(39|40) m and 0 deg at {at - begin:.1f} s: not taken for", told)
+    (log / "T_odom_cam.tum").write_text("\n".join(lines[half - 60 : half]) + "\n")
+    assert main(["fuse", str(log), "--out", str(out), "--motion", "odometry", "--no-pictures", "--overwrite"]) == 0
+    told = " ".join(capsys.readouterr().err.split())
+    assert re.search(r"tum has a hole of [12]\.\d s at 0\.0 s, a hole of [34]\.\d s at [34]\.\d s: not", told)
 
 
 def test_fuse_names_an_object_that_was_moved_and_takes_odometry_beside_the_imu(tmp_path, capsys):
