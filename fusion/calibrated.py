@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -47,6 +48,24 @@ class Calibrated:
         if self.timeshift_cam_imu_s is not None:
             calibration = replace(calibration, timeshift_cam_imu_s=self.timeshift_cam_imu_s)
         return calibration
+
+    def as_plain(self) -> dict[str, Any]:
+        """Return what calibrated.json holds: values and 1-sigmas of all but the map, which is a file of its own."""
+        found: dict[str, Any] = {}
+        if self.T_imu_cam is not None and self.extrinsic_covariance is not None:
+            sigma = np.sqrt(np.maximum(np.diag(self.extrinsic_covariance), 0.0))
+            found["T_imu_cam"] = self.T_imu_cam.as_matrix().tolist()
+            found["rotation_sigma_deg"], found["translation_sigma_m"] = (
+                np.degrees(sigma[:3]).tolist(),
+                sigma[3:].tolist(),
+            )
+        if self.timeshift_cam_imu_s is not None:
+            found["timeshift_cam_imu_s"], found["timeshift_sigma_s"] = self.timeshift_cam_imu_s, self.timeshift_sigma_s
+        if self.gravity is not None and self.gravity_sigma is not None:
+            tilt = math.hypot(self.gravity[0], self.gravity[1]), -float(self.gravity[2])
+            found["gravity_m_s2"], found["gravity_tilt_deg"] = self.gravity.tolist(), math.degrees(math.atan2(*tilt))
+            found["gravity_sigma_deg"] = math.degrees(self.gravity_sigma)
+        return found
 
 
 def calibrated(m: Memory, problem: Problem) -> Calibrated | None:

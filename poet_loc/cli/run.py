@@ -5,6 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
+import numpy as np
+
 from landmarks.options import MODES
 from poet_loc.cli.arguments import Flat, LogFolder
 from poet_loc.cli.estimates import FUSIONS, Estimates, Fusion, StageOptions, estimate_log, refuse_one_estimator, steps
@@ -62,4 +64,8 @@ def show(estimates: Estimates, out: Path) -> None:
         blocks = [Block(to_summary(estimates.evaluation))]
         print_tables([table for table in (error_table(blocks), consistency_table(blocks)) if table.rows])
         print()
+    for fused in estimates.fused:
+        for name, value in ({} if fused.calibrated is None else fused.calibrated.as_plain()).items():
+            if name != "T_imu_cam":  # calibration.yaml has it
+                print(f"{fused.name} found {name}: {np.array2string(np.asarray(value), precision=4, separator=', ')}")
     print("\n".join(named_files(out)))

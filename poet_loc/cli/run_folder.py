@@ -80,10 +80,12 @@ def write_fused(folder: Path, result: FuseResult) -> None:
 
 
 def write_calibrated(folder: Path, result: FuseResult, calibration: Calibration | None) -> None:
-    """Write what was estimated beside the trajectory, as a log has it: calibration.yaml and landmarks.json."""
+    """Write what was estimated beside the trajectory: calibration.yaml and landmarks.json, and how sure it is."""
     found = result.calibrated
     if found is None:
         return
+    if values := found.as_plain():
+        write_whole_file(folder / "calibrated.json", [json.dumps(values, indent=1) + "\n"])
     if found.T_imu_cam is not None or found.timeshift_cam_imu_s is not None:
         write_calibration(folder / "calibration.yaml", found.applied_to(calibration or Calibration()))
     if found.landmark_map is not None:

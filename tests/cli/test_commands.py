@@ -161,7 +161,7 @@ def test_localize_and_fuse_give_the_rows_of_the_run(run, clean_log, tmp_path):
         assert "T_world_imu.tum" in files(out)
 
 
-def test_fuse_writes_what_it_estimated_beside_the_trajectory(clean_log, tmp_path):
+def test_fuse_writes_what_it_estimated_beside_the_trajectory(clean_log, tmp_path, capsys):
     asked = ["fuse", str(clean_log), "--out", str(tmp_path / "run"), "--no-pictures"]
     assert main([*asked, "--estimate.extrinsics", "--estimate.time-offset", "--estimate.map", "unknown"]) == 0
     before, after = (
@@ -172,6 +172,10 @@ def test_fuse_writes_what_it_estimated_beside_the_trajectory(clean_log, tmp_path
     assert 0.0 < turned < np.radians(5.0)
     assert after.timeshift_cam_imu_s != before.timeshift_cam_imu_s
     assert after.camera == before.camera
+    told = json.loads((tmp_path / "run" / "calibrated.json").read_text())
+    assert told["timeshift_cam_imu_s"] == pytest.approx(after.timeshift_cam_imu_s)
+    assert "fuse/eskf/objects found timeshift_sigma_s: 0.0" in capsys.readouterr().out
+    assert 0.0 < told["timeshift_sigma_s"] < 0.02
     found = read_landmarks(tmp_path / "run" / "landmarks.json")
     assert {each.key for each in found} <= {each.key for each in read_landmarks(clean_log / "landmarks.json")}
     assert sum(each.covariance is not None for each in found) == len(found) > 3

@@ -9,6 +9,7 @@ import pytest
 from scipy.spatial.transform import RigidTransform
 from scipy.stats import chi2
 
+from fusion.calibrated import Calibrated
 from fusion.fuse import fuse
 from fusion.options import DetectionBias, Estimate, FuseOptions
 from fusion.simulate import SimulationOptions, simulate
@@ -84,3 +85,24 @@ def test_unknown_map(log, estimator):
 
 def test_nothing_is_said_of_what_was_taken_as_given(log):
     assert fuse(log, WHITE).calibrated is None
+
+
+def test_values_and_sigmas_of_a_file():
+    """Degrees and metres of what is found; nothing of what is not."""
+    down = 9.81 * np.array([0.0, np.sin(0.05), -np.cos(0.05)])
+    T = RigidTransform.from_exp_coords([0.0, 0.0, 0.1, 0.2, 0.0, 0.0])
+    covariance = np.diag(np.square([0.01, 0.02, 0.03, 0.1, 0.2, 0.3]))
+    told = Calibrated(T, covariance, -0.045, 0.001, down, 0.002).as_plain()
+    assert (told["timeshift_cam_imu_s"], told["timeshift_sigma_s"]) == (-0.045, 0.001)
+    np.testing.assert_allclose(told["T_imu_cam"], T.as_matrix())
+    np.testing.assert_allclose(told["rotation_sigma_deg"], np.degrees([0.01, 0.02, 0.03]))
+    np.testing.assert_allclose(told["translation_sigma_m"], [0.1, 0.2, 0.3])
+    np.testing.assert_allclose(told["gravity_m_s2"], down)
+    assert told["gravity_tilt_deg"] == pytest.approx(np.degrees(0.05))
+    assert told["gravity_sigma_deg"] == pytest.approx(np.degrees(0.002))
+    assert Calibrated(gravity=down, gravity_sigma=0.002).as_plain().keys() == {
+        "gravity_m_s2",
+        "gravity_tilt_deg",
+        "gravity_sigma_deg",
+    }
+    assert not Calibrated().as_plain()
