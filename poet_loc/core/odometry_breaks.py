@@ -83,6 +83,7 @@ def holes_between(stamps_ns: NDArray[np.int64], longest_s: float) -> Array:
     """Return how much longer than usual each of the N intervals between N + 1 stamps is, s; mostly 0."""
     seconds = np.diff(stamps_ns) * 1e-9
     usual = _running_percentile(seconds, _MOSTLY)
+    usual[:1] = seconds[1:2].sum()  # of one alone it is not known
     return np.maximum(0.0, seconds - np.maximum(longest_s, _LONG * usual))
 
 

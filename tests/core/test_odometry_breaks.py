@@ -128,6 +128,15 @@ def test_sparse_and_uneven_odometry_is_believed(seed):
     assert not believed.holes_s[10:].any()
 
 
+@pytest.mark.parametrize("rate_hz", [0.5, 1.0, 3.0])
+def test_slow_odometry_has_no_holes(rate_hz):
+    stamps = stamps_of(np.full(20, 1.0 / rate_hz))
+    still = Trajectory(stamps, RigidTransform.from_exp_coords(np.zeros((21, 6))))
+    assert odometry_breaks(still, EXPECTED) == []
+    (hole,) = odometry_breaks(Trajectory(np.r_[stamps[0] - 10**10, stamps[1:]], still.T_world_body), EXPECTED)
+    assert (hole.hole, hole.seconds) == (True, pytest.approx(10.0 + 1.0 / rate_hz))
+
+
 def test_breaks_are_named_with_stamp_and_size():
     intervals = np.full(90, 1.0 / RATE_HZ)
     intervals[60] = 2.0
