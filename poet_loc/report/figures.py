@@ -272,7 +272,7 @@ def _robust_limits(panel: Axes, error: Array, bound: Array, unit: str) -> str:
     panel.set_ylim(-limit, limit)
     beyond = np.count_nonzero(np.abs(error) > limit)
     largest = np.abs(error).max()
-    return f"; {beyond} of {len(error)} beyond, up to {largest:.{0 if largest >= 10 else 1}f} {unit}" if beyond else ""
+    return f"; {beyond} off scale, up to {largest:.{0 if largest >= 10 else 1}f} {unit}" if beyond else ""
 
 
 def _draw_axes(axes: NDArray[Any], trajectory: Trajectory, start_ns: int, style: dict[str, Any]) -> None:

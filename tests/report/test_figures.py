@@ -78,7 +78,7 @@ def test_gross_errors_do_not_shrink_the_rest(run_record: RunRecord) -> None:
     errors[3, 0] = 50.0
     axes = error_figure(replace(row, errors=errors)).axes[0]
     assert axes.get_ylim()[1] < 200.0
-    assert "1 of 102 beyond, up to 50000 mm" in axes.get_title("right")
+    assert "1 off scale, up to 50000 mm" in axes.get_title("right")
 
 
 @pytest.mark.parametrize("span", [(0.15, 6.0), (11.0, 80.0), (0.3, 0.9), (1e-3, 1e3), (1e-6, 1e5)])
