@@ -11,13 +11,11 @@ from landmarks.options import MODES
 from poet_loc.cli.arguments import Flat, LogFolder
 from poet_loc.cli.estimates import FUSIONS, Estimates, Fusion, StageOptions, estimate_log, refuse_one_estimator, steps
 from poet_loc.cli.noise_file import with_noise_from
-from poet_loc.cli.run_folder import WRITING_STEPS, named_files, write_run
+from poet_loc.cli.run_folder import WRITING_STEPS, error_tables, named_files, write_run
 from poet_loc.cli.terminal import print_tables, progress
 from poet_loc.cli.unread import refuse_unread
 from poet_loc.io.log_folder import read_log
 from poet_loc.io.whole_folder import whole_folder
-from poet_loc.report.error_tables import Block, consistency_table, error_table
-from poet_loc.report.summary import to_summary
 
 
 @dataclass(frozen=True)
@@ -61,8 +59,7 @@ def execute(arguments: Arguments) -> None:
 def show(estimates: Estimates, out: Path) -> None:
     """Print the tables of a run and name its files."""
     if estimates.evaluation is not None:
-        blocks = [Block(to_summary(estimates.evaluation))]
-        print_tables([table for table in (error_table(blocks), consistency_table(blocks)) if table.rows])
+        print_tables(error_tables(estimates.evaluation))
         print()
     for fused in estimates.fused:
         for name, value in ({} if fused.calibrated is None else fused.calibrated.as_plain()).items():

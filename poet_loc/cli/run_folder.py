@@ -24,9 +24,11 @@ from poet_loc.io.landmarks_json import write_landmarks
 from poet_loc.io.tum import write_tum
 from poet_loc.io.whole_folder import write_whole_file
 from poet_loc.report.error_tables import Block, consistency_table, error_table, table_text
+from poet_loc.report.evaluate import Evaluation
 from poet_loc.report.html_report import write_report
 from poet_loc.report.run_folder import write_states
 from poet_loc.report.summary import to_summary, write_errors_csv, write_summary
+from poet_loc.report.tables import Table
 
 WRITING_STEPS = 3
 
@@ -61,6 +63,12 @@ def write_run(
     write_whole_file(folder / "options.yaml", [options_text(asked)])
     if pictures or paper:
         _write_pictures(folder, estimates, asked, report, paper)
+
+
+def error_tables(evaluation: Evaluation) -> list[Table]:
+    """Return the tables of a run: errors, and consistency where something knows its own errors."""
+    blocks = [Block(to_summary(evaluation))]
+    return [table for table in (error_table(blocks), consistency_table(blocks)) if table.rows]
 
 
 def write_localized(folder: Path, result: LocalizeResult) -> None:
@@ -123,8 +131,7 @@ def _write_pictures(folder: Path, estimates: Estimates, asked: Any, report: Repo
     from poet_loc.report.figures import write_figures
 
     figures = write_figures(record, folder / "figures", paper)
-    blocks = [] if estimates.evaluation is None else [Block(to_summary(estimates.evaluation))]
-    tables = [table for table in (error_table(blocks), consistency_table(blocks)) if blocks and table.rows]
+    tables = [] if estimates.evaluation is None else error_tables(estimates.evaluation)
     title = f"poet-loc on {estimates.log.path.resolve().name}"
     write_report(folder / "report.html", title, tables, figures, options_text(asked))
     report.step("record for rerun")

@@ -224,6 +224,18 @@ def test_what_a_log_lacks_is_said_and_left_out(missing, said, gone, kept, log, t
     assert not gone & there
 
 
+@pytest.mark.parametrize("command", ["fuse", "localize"])
+def test_a_log_without_ground_truth_is_drawn(command, log, tmp_path):
+    for name in ("T_world_cam.tum", "T_world_imu.tum"):
+        (log / name).unlink()
+    out = tmp_path / "run"
+    assert main([command, str(log), "--out", str(out)]) == 0
+    assert {"report.html", "recording.rrd", "options.yaml"} <= files(out)
+    assert (out / "figures" / "top_view.png").is_file()
+    assert "top_view" in (out / "report.html").read_text()
+    assert "No ground truth: no errors." in (out / "report.html").read_text()
+
+
 def test_fuse_without_the_imu_that_was_asked_for_is_one_line(log, tmp_path, capsys):
     (log / "imu.csv").unlink()
     assert main(["fuse", str(log), "--motion", "imu", "--out", str(tmp_path / "run")]) == 1
