@@ -26,9 +26,10 @@ from fusion.nav_state import Array, Ints
     MIN_OBJECTS,
     MIN_PLACES,
     LEAD,
+    LOST_SIGMA,
     IS_GIVEN,
     GIVEN_POSE,
-) = range(18)
+) = range(19)
 GIVEN_POSE_SIZE = 12  # rotation, position
 
 AT_ITS_PLACE, WHOLE = 1, 2  # what of a vote agrees with a correction

@@ -10,13 +10,14 @@ import math
 from fusion.bias_spread import follow_spreads
 from fusion.columns import OUT_CORE, OUT_SIGMA, Columns, Rows
 from fusion.compiled import njit
-from fusion.eskf import ACCEPTED, REJECTED
+from fusion.eskf import ACCEPTED, POSITION_ONLY, REJECTED
 from fusion.filter_motion import advance, begin, find_rate
 from fusion.filter_update import LIMIT_BOTH, follow_jumps, forget_biases, is_lost, is_unsettled, put_object, take
 from fusion.measurements import OBJECT_POSE, ODOMETRY_STEP
 from fusion.meeting import PUT, START_AGAIN, UNKNOWN_MAP, choose_anchor, forget_rivals, suppose
 from fusion.memory import (
     CLONED,
+    CLONED_AT,
     DELAY,
     INITIALISING,
     LAST_STAMP,
@@ -26,9 +27,9 @@ from fusion.memory import (
     NOW,
     REFUSED_ROW,
     REPLACED,
-    RESTARTS,
-    STARTED_AT,
     TRACKING,
+    UNHELD_ROW,
+    UNHELD_SINCE,
     UNSURE_AT,
     Memory,
     Work,
@@ -37,9 +38,10 @@ from fusion.memory import (
 )
 from fusion.nav_state import AT_TIME_OFFSET, GYRO_BIAS_ERROR, N_ERROR, N_OBJECTS, TIME_OFFSET, Array, Ints
 from fusion.new_states import clone_pose
-from fusion.object_biases import decay_biases
+from fusion.object_biases import decay_biases, is_fair
 from fusion.place_watch import RELEASE, return_to_map, tally, watch
-from fusion.starting import adopt, cast_vote, restart_if_lost, try_to_start
+from fusion.refused_odometry import follow_refusals
+from fusion.starting import cast_vote, restart_if_lost, start_again, try_to_start
 from fusion.tape import note_clone, note_decay, note_row
 
 PENDING = -1  # beside the decisions of the gate
@@ -144,6 +146,7 @@ def measure(m: Memory, w: Work, log: Columns, first: int, last: int) -> None:
         decay_biases(m)
         for j in range(first, poses if c[CLONED] == 1 else first):
             log.decisions[j] = take(m, w, log, j, True)
+            follow_refusals(m, w, log, j)
     if poses < last:
         if m.meeting[UNKNOWN_MAP] > 0.0:
             choose_anchor(m, log.kinds, log.objects, poses, last)
@@ -224,29 +227,31 @@ def meet(m: Memory, w: Work, log: Columns, j: int) -> int:
         return_to_map(m, k)
     if found == START_AGAIN:
         m.inliers[:] = 0
-        adopt(m, w, GYRO_BIAS_ERROR)
+        start_again(m, w, GYRO_BIAS_ERROR)
         for i in range(m.layout[N_OBJECTS]):
             m.known[i] = 1.0 if i == k else 0.0
         forget_rivals(m, True)
-        m.counters[RESTARTS] += 1
-        m.counters[STARTED_AT] = m.counters[NOW]
     return found
 
 
 @njit(cache=True)
 def account(m: Memory, w: Work, log: Columns, first: int, last: int) -> None:
     """Draw the conclusions of what became of the measurements of a stamp: jumps, votes, tallies, moved objects."""
-    c, accepted, refused = m.counters, False, 0
+    c, accepted, held, refused = m.counters, False, False, 0
     for j in range(first, last):
         kind, k, decision = log.kinds[j], log.objects[j], log.decisions[j]
         follow_jumps(m, log, j)
         cast_vote(m, w, kind, k, log.rotations[j], log.translations[j], log.covariances[j], decision)
         accepted = accepted or decision & ACCEPTED != 0
+        held = held or (decision & POSITION_ONLY != 0 and (kind != OBJECT_POSE or is_fair(m, k)))
         refused += decision == REJECTED
         if c[MODE] == TRACKING:
             tally(m, kind, k, decision, log.nis[j, 0], m.limits[LIMIT_BOTH])
     if c[MODE] != TRACKING:
         return
+    if c[UNHELD_ROW] == 0:
+        c[UNHELD_SINCE] = c[NOW]
+    c[UNHELD_ROW] = 0 if held else c[UNHELD_ROW] + last - first
     c[REFUSED_ROW] = 0 if accepted else c[REFUSED_ROW] + refused
     if accepted:
         c[LAST_UPDATE] = c[NOW]
@@ -260,7 +265,7 @@ def account(m: Memory, w: Work, log: Columns, first: int, last: int) -> None:
 def _clone(m: Memory) -> None:
     """Keep the pose of now as what the next odometry is measured against."""
     clone_pose(m.x, m.P, m.layout)
-    m.counters[CLONED] = 1
+    m.counters[CLONED], m.counters[CLONED_AT] = 1, m.counters[NOW]
     if len(m.tape) > 0:
         note_clone(m)
 

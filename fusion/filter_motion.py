@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 
-from fusion.ballot import START_WINDOW_S
+from fusion.ballot import LONGEST_WINDOW_S, LOST_SIGMA, LOST_WINDOW_S, MIN_VOTES, START_WINDOW_S
 from fusion.compiled import njit
 from fusion.imu import (
     GUESSED,
@@ -23,12 +23,14 @@ from fusion.memory import (
     NOW,
     RESTARTS,
     TRACKING,
+    UNHELD_ROW,
+    UNHELD_SINCE,
     UP_COUNT,
     VOTE_HEAD,
     Memory,
     Work,
 )
-from fusion.nav_state import AT_GRAVITY, GRAVITY, GYRO_BIAS, POSITION, Array, Ints
+from fusion.nav_state import ACCEL_BIAS, AT_CLONE, AT_GRAVITY, AT_OBJECTS, GRAVITY, GYRO_BIAS, POSITION, Array, Ints
 from fusion.odometry import IS_ODOMETRY, move_by_odometry, spread_by_odometry
 from fusion.tape import note_odometry, note_step
 
@@ -74,24 +76,41 @@ def advance(m: Memory, w: Work, imu_stamps: Ints, imu_values: Array, until: int)
         c[NOW] = stop
         if stop == end:
             c[IMU_AT] = k + 1
-    give_up_where_anywhere(m, imu_values[c[IMU_AT], 3:6])
+    give_up_where_lost(m, imu_values[c[IMU_AT], 3:6])
 
 
 @njit(cache=True)
-def give_up_where_anywhere(m: Memory, specific_force: Array) -> None:
-    """Wait for a new start where the motion is but a guess and, by now, the camera may look anywhere.
+def give_up_where_lost(m: Memory, specific_force: Array) -> None:
+    """Wait for a new start where the camera may by now look anywhere, or where the filter has shut itself out.
 
     What a filter makes of detections there is a turn and a speed that nobody saw, which then carry it further away.
     """
-    c = m.counters
-    guessed = c[MODE] == TRACKING and m.noise[GUESSED] > 0.0
-    if guessed and not m.P[0, 0] + m.P[1, 1] + m.P[2, 2] < math.pi**2:
-        last = c[LAST_STAMP]
-        begin(m, c[NOW], specific_force, c[IMU_AT])
-        c[LAST_STAMP], c[VOTE_HEAD] = last, 0
-        c[RESTARTS] += 1
+    if m.counters[MODE] == TRACKING and (_looks_anywhere(m) or _is_shut_out(m)):
+        last = m.counters[LAST_STAMP]
+        begin(m, m.counters[NOW], specific_force, m.counters[IMU_AT])
+        m.counters[LAST_STAMP], m.counters[VOTE_HEAD] = last, 0
+        m.counters[RESTARTS] += 1
         for i in range(3):
-            m.x[GYRO_BIAS + i] = 0.0
+            m.x[ACCEL_BIAS + i] = 0.0
+            if m.noise[GUESSED] > 0.0:
+                m.x[GYRO_BIAS + i] = 0.0
+
+
+@njit(cache=True)
+def _looks_anywhere(m: Memory) -> bool:
+    """Tell whether the motion is but a guess and nothing is known of the attitude."""
+    return m.noise[GUESSED] > 0.0 and not m.P[0, 0] + m.P[1, 1] + m.P[2, 2] < math.pi**2
+
+
+@njit(cache=True)
+def _is_shut_out(m: Memory) -> bool:
+    """Tell whether nothing that was seen for long has held a state that needs it: it would go on so."""
+    c, known_map = m.counters, m.layout[AT_OBJECTS] < 0
+    if not known_map or c[UNHELD_ROW] < m.start[MIN_VOTES]:
+        return False
+    seconds, drifts = (c[NOW] - c[UNHELD_SINCE]) * 1e-9, m.layout[AT_CLONE] < 0 and m.noise[IS_ODOMETRY] == 0.0
+    unsure = max(m.P[3, 3], m.P[4, 4], m.P[5, 5]) > m.start[LOST_SIGMA] ** 2
+    return (seconds > m.start[LOST_WINDOW_S] and unsure) or (seconds > m.start[LONGEST_WINDOW_S] and drifts)
 
 
 @njit(cache=True)

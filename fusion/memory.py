@@ -38,8 +38,12 @@ VOTES = 256  # a second of eight objects at 30 Hz; a power of two, so that place
     LEAST_DELAY,  # the least that this ever was
     LAST_STAMP,  # of the measurements taken in last
     UNSURE_AT,  # when the attitude was last so unsure that poses are judged anew: votes from before do not count
+    CLONED_AT,  # when the clone was made
+    REFUSED_ODOMETRY,  # how often in a row odometry's way was refused, its turn not
+    UNHELD_ROW,  # how many poses in a row were refused, or let in by a gross error's bias alone
+    UNHELD_SINCE,  # the stamp of the first of these
     N_COUNTERS,
-) = range(19)
+) = range(23)
 INITIALISING, TRACKING = 0, 1
 
 TALLY_SIZE, PLACE_SIZE = 8, 15  # rows of tallies and places, see place_watch.py

@@ -98,3 +98,9 @@ def _part(component: int) -> int:
     if component < 3:
         return BIAS_ROTATION
     return BIAS_ALONG if component == 5 else BIAS_ACROSS
+
+
+@njit(cache=True)
+def is_fair(m: Memory, k: int) -> bool:
+    """Tell whether an object's place is not grossly wrong, by its varying bias."""
+    return m.layout[N_BIAS_KINDS] == 0 or fades(m.x, m.layout[BIASES] + 6 * k, 3, 0, m.bias_model)

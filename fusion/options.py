@@ -172,9 +172,10 @@ class HealthOptions:
     coasting_after_s: float = 0.5
     """Without an accepted pose for so long it is coasting, s;"""
     lost_sigma: float = 0.5
-    """coasting, it is lost where the position's 1-sigma along an axis is beyond this, m,"""
+    """coasting, it is lost where the position's 1-sigma along an axis is beyond this, m; so unsure, and refusing all
+    that it saw for --start.lost-window-s, it waits for a new start;"""
     lost_refused: int = 60
-    """or where so many poses in a row were refused."""
+    """it is lost, too, where so many poses in a row were refused."""
 
 
 @dataclass(frozen=True)

@@ -52,6 +52,7 @@ from fusion.reference_models import (
     transition,
     transport,
 )
+from fusion.refused_odometry import follow_refusals
 from fusion.result import FuseResult
 from fusion.scatter import follow_scatter
 from poet_loc.core.geometry import make_pose
@@ -95,7 +96,7 @@ class ReferenceFilter:
                 self._step((stop - now) * 1e-9, (imu_stamps[k + 1] - imu_stamps[k]) * 1e-9, values, imu_values[k + 1])
             c[memory.NOW] = stop
             c[memory.IMU_AT] += stop == imu_stamps[k + 1]
-        filter_motion.give_up_where_anywhere(m, imu_values[c[memory.IMU_AT], 3:6])
+        filter_motion.give_up_where_lost(m, imu_values[c[memory.IMU_AT], 3:6])
 
     def _step(self, dt: float, interval: float, values: Array, sample: Array) -> None:
         m = self.m
@@ -179,6 +180,7 @@ class ReferenceFilter:
                 R_m, R = self._fit_symmetry(k, R_m, R)
         rate, offset = self.work.rate, self.work.offset[0]
         residual, H = residual_and_jacobian(kind, k, R_m, t_m, m.x, rate, offset, self.layout)
+        self.work.residual[:] = residual
         if kind == OBJECT_POSE:
             follow_scatter(m, k, t_m, residual)
         decision, status = self.gate(residual, H @ m.P @ H.T + R, nis), status_of(m, kind, k)
@@ -206,7 +208,7 @@ class ReferenceFilter:
         m, start = self.m, self.layout.clone_start
         self.spread(cloning(m.x, self.layout), np.zeros_like(m.P))
         m.x[start : start + 12] = m.x[:12]
-        m.counters[memory.CLONED] = 1
+        m.counters[memory.CLONED], m.counters[memory.CLONED_AT] = 1, m.counters[memory.NOW]
 
     def _put_object(self, log: Columns, j: int) -> None:
         """Put an object whose pose in the world is unknown where detection j sees it.
@@ -262,6 +264,7 @@ class ReferenceFilter:
             self.decay_biases()
             for j in range(odometry, first if c[memory.CLONED] else odometry):
                 decisions[j] = self.take(log, j)
+                follow_refusals(m, self.work, log, j)
         if odometry < first == last:
             if self.tracking:
                 self.clone()

@@ -35,6 +35,7 @@ from fusion.memory import (
     RESTARTS,
     STARTED_AT,
     TRACKING,
+    UNHELD_ROW,
     UNSURE_AT,
     VOTE_HEAD,
     Memory,
@@ -44,6 +45,7 @@ from fusion.nav_state import (
     AT_BIASES,
     AT_TIME_OFFSET,
     BIASES,
+    CORE,
     EXTRINSIC_POSITION,
     EXTRINSIC_ROTATION,
     GRAVITY,
@@ -282,9 +284,28 @@ def restart_if_lost(m: Memory, w: Work) -> None:
         if 2 * count < head - first:
             return
     if count >= m.start[LOST_MIN_VOTES] and count > 3.0 * used and not _is_contested(m, w, first):
-        adopt(m, w, GYRO_BIAS_ERROR)
-        m.counters[RESTARTS] += 1
-        m.counters[STARTED_AT] = m.counters[NOW]
+        start_again(m, w, GYRO_BIAS_ERROR)
+
+
+@njit(cache=True)
+def start_again(m: Memory, w: Work, keep_from: int) -> None:
+    """Adopt the agreed pose, and count it as a new start."""
+    adopt(m, w, keep_from)
+    m.counters[RESTARTS] += 1
+    m.counters[STARTED_AT] = m.counters[NOW]
+
+
+@njit(cache=True)
+def start_again_in_place(m: Memory, w: Work, missed: Array, seconds: float) -> None:
+    """Start again at the state's own pose, as unsure as at a start, faster by what it missed (3,), m, in so long."""
+    agreed = agreed_correction(m, w)
+    for i in range(9):
+        agreed.C[i] = 1.0 if i % 4 == 0 else 0.0
+    for i in range(3):
+        agreed.d[i] = agreed.origin[i] = m.x[POSITION + i]
+        agreed.v[i], agreed.origin[3 + i] = missed[i] / seconds, 0.0
+    agreed.agreed[:] = 0
+    start_again(m, w, CORE)
 
 
 @njit(cache=True)
@@ -315,7 +336,7 @@ def adopt(m: Memory, w: Work, keep_from: int) -> None:
         kind, component = i // (6 * m.layout[N_OBJECTS]), i % 6
         m.x[m.layout[BIASES] + i] = 0.0
         m.P[at + i, at + i] = bias_sigma(m.bias_model, kind, component) ** 2
-    m.counters[BIAS_TIME], m.counters[CLONED] = m.counters[NOW], 0
+    m.counters[BIAS_TIME], m.counters[CLONED], m.counters[UNHELD_ROW] = m.counters[NOW], 0, 0
     forget_places(m)
     forget_rivals(m, False)
     # The agreeing votes count as used, so that a restart is not followed by the next at once.

@@ -56,7 +56,7 @@ def tape_bound(layout: Ints, samples: int, stamps: int, measurements: int) -> in
     steps, row = (samples + stamps) * (STEP_SIZE + TAIL), 1 + CORE + 6 + CORE * n + TAIL
     correction = 1 + 9 * (3 + K) + 2 + MAX_COLUMNS + 6 * MAX_COLUMNS + 6 + 6 * n + TAIL
     meeting_and_forgetting = 2 + MAX_COLUMNS + 6 * MAX_COLUMNS + TAIL + 8 * (2 + TAIL)
-    per_stamp = biases + TAIL + n + TAIL + 18 + TAIL
+    per_stamp = biases + TAIL + 2 * (n + TAIL) + 18 + TAIL
     return steps + (samples + stamps) * row + stamps * per_stamp + measurements * (correction + meeting_and_forgetting)
 
 

@@ -1,0 +1,120 @@
+"""A state that gross errors have led astray refuses what is right: it must not go on so, but start again."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from filter_runs import assert_same, run
+from test_online import assert_ends_like, estimator_for, feed, shuffled
+
+from fusion import filter_loop, memory, reference_filter
+from fusion.fuse import fuse
+from fusion.options import FuseOptions
+from fusion.prepare import pose_problem
+from fusion.result import FuseResult
+from fusion.simulate import SimulationOptions, simulate
+from poet_loc.core.geometry import make_pose
+from poet_loc.io.log_folder import Log, read_log
+
+ASTRAY_FROM_S, ASTRAY_UNTIL_S, ACCELERATION = 0.8, 2.2, np.array([1.2, -0.6, 0.0])
+
+
+def led_astray(seed: int, rate_hz: float, odometry: bool) -> Log:
+    """Return a log whose one object, soon after the start, seems to run away: as if the camera had accelerated.
+
+    Then nothing is seen for a second, and from then on the object is where it should be, so many times per second. The
+    odometry begins when it has run away.
+    """
+    world = {"duration_s": 25.0, "camera_rate_hz": 30.0, "imu_rate_hz": 100.0, "objects": 1, "symmetric_objects": 0}
+    log = simulate(SimulationOptions(seed=seed, noise="white", covariances=False, odometry=odometry, **world))
+    poses, begin_ns = log.object_poses[""], log.imu.stamps_ns[0]
+    seconds = (poses.stamps_ns - begin_ns) * 1e-9
+    apparent = 0.5 * np.maximum(seconds - ASTRAY_FROM_S, 0.0)[:, None] ** 2 * ACCELERATION
+    apparent[seconds > ASTRAY_UNTIL_S] = 0.0
+    R_world_cam = log.T_world_cam.interpolate(poses.stamps_ns)[0].rotation
+    t_cam_obj = poses.T_cam_obj.translation - R_world_cam.inv().apply(apparent)
+    poses = replace(poses, T_cam_obj=make_pose(poses.T_cam_obj.rotation, t_cam_obj))
+    rare = poses.frames % round(30.0 / rate_hz) == 0
+    poses = poses[(seconds < ASTRAY_UNTIL_S) | ((seconds > ASTRAY_UNTIL_S + 1.0) & rare)]
+    if log.T_odom_cam is not None:
+        whole = log.T_odom_cam
+        log = replace(log, T_odom_cam=whole.between(begin_ns + int(ASTRAY_UNTIL_S * 1e9), whole.stamps_ns[-1]))
+    return replace(log, object_poses={"": poses})
+
+
+def errors(result: FuseResult, log: Log) -> tuple[np.ndarray, np.ndarray]:
+    """Return seconds since the log began and position errors, m."""
+    truth = log.T_world_imu
+    rows = (result.stamps_ns >= truth.stamps_ns[0]) & (result.stamps_ns <= truth.stamps_ns[-1])
+    T, seconds = truth.interpolate(result.stamps_ns[rows])[0], (result.stamps_ns[rows] - log.imu.stamps_ns[0]) * 1e-9
+    return seconds, np.linalg.norm(result.T_world_imu[rows].translation - T.translation, axis=1)
+
+
+@pytest.mark.parametrize("estimator", ["eskf", "graph"])
+@pytest.mark.parametrize(("seed", "rate_hz"), [(0, 2.0), (4, 5.0)])
+def test_odometry_that_the_imu_contradicts_mends_the_velocity(estimator, seed, rate_hz):
+    log = led_astray(seed, rate_hz, odometry=True)
+    result = fuse(log, FuseOptions(estimator=estimator))
+    seconds, position = errors(result, log)
+    assert position.max() < 5.0  # without: 25 to 1,000 m
+    assert position[seconds > 10.0].max() < 0.15
+    assert result.restarts >= 1
+
+
+@pytest.mark.parametrize("estimator", ["eskf", "graph"])
+@pytest.mark.parametrize("seed", [1, 2])
+def test_a_filter_that_refuses_all_it_sees_waits_for_a_new_start(estimator, seed):
+    log = led_astray(seed, 3.0, odometry=False)
+    result = fuse(log, FuseOptions(estimator=estimator))
+    seconds, position = errors(result, log)
+    silent = np.diff(seconds).max()
+    assert 0.5 < silent < 4.0
+    assert position[seconds > 15.0].max() < 0.2  # without: hundreds of metres
+    assert result.restarts == 1
+
+
+def test_a_filter_that_sees_nothing_goes_on():
+    log = led_astray(3, 3.0, odometry=False)
+    poses = log.object_poses[""]
+    seconds = (poses.stamps_ns - log.imu.stamps_ns[0]) * 1e-9
+    log = replace(log, object_poses={"": poses[(seconds < ASTRAY_FROM_S) | (seconds > 24.5)]})
+    result = fuse(log, FuseOptions())
+    gap = result.stamps_ns[np.searchsorted(result.stamps_ns, poses.stamps_ns[0] + 10**9) :]
+    assert np.diff(gap).max() < 20_000_000
+
+
+@pytest.mark.parametrize("odometry", [True, False])
+def test_compiled_is_plain_where_the_filter_is_led_astray(odometry):
+    options = FuseOptions()
+    problem = pose_problem(led_astray(1, 3.0, odometry), options)
+    compiled, plain = (run(loop, problem, options) for loop in (filter_loop.run_log, reference_filter.run_log))
+    assert compiled.memory.counters[memory.RESTARTS] > 0
+    assert_same(compiled, plain, tolerance=1e-7)
+
+
+def test_fed_one_by_one_and_late_it_is_the_same():
+    options = FuseOptions()
+    problem = pose_problem(led_astray(2, 3.0, odometry=False), options)
+    estimator = estimator_for(problem, options)
+    for event in shuffled(problem, 0.2, np.random.default_rng(0)):
+        feed(estimator, problem, event)
+    assert_ends_like(estimator, problem, options)
+
+
+@pytest.mark.parametrize("estimator", ["eskf", "graph"])
+def test_on_real_logs_nothing_runs_away(shared_data, estimator):
+    """Windows of real logs in which gross errors after the start sent the filter off by 50 and 60 m."""
+    for folder, motion, begin_s, seconds, each in (("0055", "auto", 20.83, 32.17, 1), ("0001", "imu", 2.47, 34.5, 10)):
+        log = read_log(shared_data / "ycbv_dope" / folder)
+        poses = log.object_poses["synthetic"]
+        poses = poses[(poses.object_ids == 3) & (poses.frames % each == 0)]
+        begin_ns = log.object_poses["synthetic"].stamps_ns[0] + int(begin_s * 1e9)
+        end_ns = begin_ns + int(seconds * 1e9)
+        imu = log.imu[(log.imu.stamps_ns >= begin_ns) & (log.imu.stamps_ns <= end_ns)]
+        odometry = log.T_odom_cam.between(begin_ns, end_ns)
+        poses = poses[(poses.stamps_ns >= begin_ns) & (poses.stamps_ns <= end_ns)]
+        window = replace(log, imu=imu, T_odom_cam=odometry, object_poses={"": poses})
+        _, position = errors(fuse(window, FuseOptions(estimator=estimator, motion=motion)), window)
+        assert np.sqrt(np.mean(position**2)) < 4.0
