@@ -15,7 +15,7 @@ from fusion.nav_state import N_ERROR, POSITION, POSITION_ERROR, VELOCITY, Array,
 from fusion.options import FuseOptions
 from fusion.so3_kernels import apply, exp_so3, left_jacobian, multiply, orthonormalise, times_skew
 from poet_loc.core.geometry import local
-from poet_loc.core.odometry_breaks import Expected, believed_motion, holes_between, unseen_sigmas
+from poet_loc.core.odometry_breaks import Expected, believed_motion, unseen_sigmas
 from poet_loc.core.records import ImuSamples
 from poet_loc.core.trajectory import Trajectory
 
@@ -52,21 +52,17 @@ def believed_samples(
 ) -> tuple[ImuSamples, Array]:
     """Return what to believe of `odometry_samples`, and the variances (N, 2) per second of what is not known of it.
 
-    Where measurements of stamps_ns lie in holes before and behind it, the body stands still, which nobody believes.
+    Where measurements of stamps_ns lie before and behind it, the body stands still, which nobody believes.
     """
     stamps, expected = samples.stamps_ns, expected_of(options)
-    twists = np.hstack([samples.angular_velocity, samples.specific_force])[:-1]
-    found = believed_motion(stamps, twists, expected)
-    twists, sigmas = found.twists, found.sigmas
-    first, last = (stamps_ns[0], stamps_ns[-1]) if len(stamps_ns) else (stamps[0], stamps[-1])
-    behind = holes_between(np.r_[stamps, max(last, stamps[-1])], expected.longest_s)[-1:]
-    if behind[0] > 0.0:
-        stamps, twists = np.r_[stamps, last], np.vstack([twists, np.zeros(6)])
-        sigmas = np.vstack([sigmas, unseen_sigmas(behind, expected)])
-    before = np.array([(stamps[0] - first) * 1e-9 - expected.longest_s])
-    if before[0] > 0.0:
-        stamps, twists = np.r_[first, stamps], np.vstack([np.zeros(6), twists])
-        sigmas = np.vstack([unseen_sigmas(before, expected), sigmas])
+    found = believed_motion(stamps, np.hstack([samples.angular_velocity, samples.specific_force])[:-1], expected)
+    twists, sigmas, still = found.twists, found.sigmas, np.zeros(6)
+    if len(stamps_ns) and stamps_ns[0] < stamps[0]:
+        unseen = unseen_sigmas(np.array([stamps[0] - stamps_ns[0]]) * 1e-9, expected)
+        stamps, twists, sigmas = np.r_[stamps_ns[0], stamps], np.vstack([still, twists]), np.vstack([unseen, sigmas])
+    if len(stamps_ns) and stamps_ns[-1] > stamps[-1]:
+        unseen = unseen_sigmas(np.array([stamps_ns[-1] - stamps[-1]]) * 1e-9, expected)
+        stamps, twists, sigmas = np.r_[stamps, stamps_ns[-1]], np.vstack([twists, still]), np.vstack([sigmas, unseen])
     doubts, twists = sigmas**2 / (np.diff(stamps)[:, None] * 1e-9), np.vstack([twists, twists[-1:]])
     kept = np.ascontiguousarray(twists[:, :3]), np.ascontiguousarray(twists[:, 3:])
     return ImuSamples(stamps, *kept), np.vstack([doubts, doubts[-1:]])

@@ -34,9 +34,11 @@ def breaks_of(log: Log, expected: Expected) -> list[Break]:
     if odometry is None or not len(odometry):
         return []
     begin, end = int(odometry.stamps_ns[0]), int(odometry.stamps_ns[-1])
+    usual_s = float(np.median(np.diff(odometry.stamps_ns))) * 1e-9 if len(odometry) > 1 else 0.0
     first = min([begin, *(int(each.stamps_ns.min()) for each in poses if each)])
     last = max([end, *(int(each.stamps_ns.max()) for each in poses if each)])
-    return [*hole_between(first, begin), *odometry_breaks(odometry, expected), *hole_between(end, last)]
+    before, behind = hole_between(first, begin, usual_s), hole_between(end, last, usual_s)
+    return [*before, *odometry_breaks(odometry, expected), *behind]
 
 
 def _size(jump: Break) -> float:

@@ -152,7 +152,7 @@ def odometry_breaks(T_odom_cam: Trajectory, expected: Expected) -> list[Break]:
     ]
 
 
-def hole_between(start_ns: int, end_ns: int) -> list[Break]:
-    """Return the time in which there is no odometry at all as a hole; none where it is no more than half a second."""
+def hole_between(start_ns: int, end_ns: int, usual_s: float) -> list[Break]:
+    """Return the time in which there is no odometry at all as a hole; none where it is short, or odometry that slow."""
     seconds = (end_ns - start_ns) * 1e-9
-    return [Break(start_ns, seconds, True, 0.0, 0.0)] if seconds > _TOLD_S else []
+    return [Break(start_ns, seconds, True, 0.0, 0.0)] if seconds > max(_TOLD_S, _LONG * usual_s) else []

@@ -20,7 +20,7 @@ from fusion.odometry import expected_of
 from fusion.options import FuseOptions
 from fusion.simulate import SimulationOptions, simulate
 from poet_loc.check.doctor import diagnose, write_repaired
-from poet_loc.check.odometry import EXPECTED
+from poet_loc.check.odometry import EXPECTED, breaks_of
 from poet_loc.cli.main import main
 from poet_loc.core.geometry import make_pose
 from poet_loc.io.log_folder import read_log, write_log
@@ -167,6 +167,13 @@ def test_a_trajectory_in_nanoseconds_is_told_with_line_and_remedy(good_log, tmp_
     assert (finding.check, finding.file, finding.evidence["line"]) == ("unreadable", "T_world_imu.tum", 1)
     assert "is no time in seconds" in finding.what
     assert "TUM wants seconds" in finding.fix
+
+
+@pytest.mark.parametrize("every", [1, 10, 30])
+def test_odometry_that_is_slow_has_no_breaks(every) -> None:
+    """Nor where its first pose comes within an interval of the first detection, and its last likewise."""
+    log = simulate(SimulationOptions(duration_s=12.0, seed=4, odometry=True))
+    assert breaks_of(replace(log, T_odom_cam=log.T_odom_cam[every - 1 :: every]), EXPECTED) == []
 
 
 def test_odometry_is_expected_to_be_as_fusion_expects_it():

@@ -206,7 +206,7 @@ def test_where_time_begins_does_not_matter(log, begin_s):
     assert found.restarts == expected.restarts > 0
 
 
-@pytest.mark.parametrize("kept", [slice(0, 2), slice(0, 3), slice(150, 152), slice(-2, None)])
+@pytest.mark.parametrize("kept", [slice(0, 2), slice(0, 3), slice(150, 152), slice(-2, None), slice(15, None, 30)])
 def test_a_few_poses_of_odometry_leave_all_else_to_the_detections(log, kept):
     """What lies before and behind them is no measure of how long its intervals usually are."""
     result = fuse(replace(log, T_odom_cam=log.T_odom_cam[kept]), ODOMETRY)
