@@ -24,6 +24,7 @@ _TILT_DEG, _TILT_OF_ONE_DEG = 25.0, 60.0
 _MOST_FRAMES = 400
 _DYNAMICS_S = 0.6
 _ANSWER = 0.3
+_OPEN_RAD = 1.0  # 1-sigma from which an attitude is not known
 
 
 def check_gravity(log: Log) -> Iterator[Finding]:
@@ -92,7 +93,10 @@ def _imu_attitudes(log: Log) -> Iterator[tuple[str, Trajectory]]:
 
 
 def solved(log: Log) -> dict[str, Trajectory]:
-    """Return a camera trajectory from each set of detections, some hundred frames of it."""
+    """Return a camera trajectory from each set of detections, some hundred frames of it.
+
+    Frames whose attitude the detections leave open, as one symmetric object does, are left out.
+    """
     if log.landmark_map is None:
         return {}
     trajectories = {}
@@ -100,6 +104,8 @@ def solved(log: Log) -> dict[str, Trajectory]:
         stamps = np.unique(poses.stamps_ns)
         kept = stamps[:: max(1, -(-len(stamps) // _MOST_FRAMES))]
         camera = solve(poses[np.isin(poses.stamps_ns, kept)], log.landmark_map, SolverOptions(mode="out")).camera_poses
+        assert camera.covariances is not None
+        camera = camera[np.linalg.eigvalsh(camera.covariances[:, :3, :3])[:, -1] < _OPEN_RAD**2]
         if len(camera) > 5:
             trajectories[name] = Trajectory(camera.stamps_ns, camera.T_world_cam)
     return trajectories

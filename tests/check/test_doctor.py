@@ -23,6 +23,7 @@ from poet_loc.check.doctor import diagnose, write_repaired
 from poet_loc.check.odometry import EXPECTED, breaks_of
 from poet_loc.cli.main import main
 from poet_loc.core.geometry import make_pose
+from poet_loc.core.records import LandmarkMap, Symmetry
 from poet_loc.io.log_folder import read_log, write_log
 
 
@@ -140,6 +141,18 @@ def test_a_calibration_that_cannot_be_read_states_no_time_offset(tmp_path) -> No
     findings = {finding.check: finding for finding in diagnose(tmp_path).findings}
     assert findings.keys() == {"missing", "time-offset"}
     assert "set timeshift_cam_imu: 0.2" in findings["time-offset"].fix
+
+
+def test_one_symmetric_object_does_not_put_the_ground_truth_elsewhere(tmp_path) -> None:
+    """Its detections leave the camera's place on a circle open: they say nothing against the truth."""
+    log = simulate(SimulationOptions(duration_s=12.0, objects=1, symmetric_objects=0, noise="white"))
+    poses, (can,) = log.object_poses[""], log.landmark_map
+    turns = np.random.default_rng(0).uniform(-np.pi, np.pi, len(poses))
+    spun = poses.T_cam_obj.rotation * Rotation.from_rotvec(np.outer(turns, [0.0, 0.0, 1.0]))
+    seen = replace(poses, T_cam_obj=make_pose(spun, poses.T_cam_obj.translation))
+    can = replace(can, symmetry=Symmetry((0.0, 0.0, 1.0), "continuous"))
+    write_log(tmp_path, replace(log, object_poses={"": seen}, landmark_map=LandmarkMap((can,))))
+    assert not diagnose(tmp_path).findings
 
 
 def test_the_command(good_log, tmp_path, capsys) -> None:
