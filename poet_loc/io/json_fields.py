@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from reprlib import repr as shortened
 from typing import Any
 
 import numpy as np
@@ -30,7 +31,7 @@ def required(fields: Mapping[str, Any], name: str) -> Any:
 def whole_number(value: Any, name: str) -> int:
     """Return an integer of 64 bits.  Raises FieldError for anything else."""
     if isinstance(value, bool) or not isinstance(value, int) or not -(2**63) <= value < 2**63:
-        raise FieldError(f"{name} is {value!r}, no whole number of 64 bits")
+        raise FieldError(f"{name} is {shortened(value)}, no whole number of 64 bits")
     return value
 
 

@@ -7,6 +7,7 @@ import warnings
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from reprlib import repr as shortened
 from typing import Any, NoReturn
 
 import numpy as np
@@ -209,7 +210,7 @@ def _wrong_cell(cell: str, dtype: np.dtype[Any]) -> str | None:
     try:
         np.loadtxt([cell], dtype, delimiter=",", comments=None)
     except (ValueError, OverflowError):
-        return f"holds {cell!r} where a {'whole number of 64 bits' if dtype.kind == 'i' else 'number'} belongs"
+        return f"holds {shortened(cell)} where a {'whole number of 64 bits' if dtype.kind == 'i' else 'number'} belongs"
     return None
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from decimal import Decimal, InvalidOperation
 from pathlib import Path
+from reprlib import repr as shortened
 from typing import Any
 
 import numpy as np
@@ -86,7 +87,7 @@ def read_seconds_column(table: NumberTable) -> Stamps:
     for row in np.flatnonzero(~plain):
         value = _nanoseconds(texts[row].decode(errors="replace"))
         if value is None or abs(value) > _INT64_MAX:
-            what = f"{texts[row].decode(errors='replace')!r} is no time in seconds"
+            what = f"{shortened(texts[row].decode(errors='replace'))} is no time in seconds"
             table.refuse(np.arange(len(table)) == row, what, "TUM wants seconds, for example 1403715273.312140000")
         else:
             stamps[row] = value

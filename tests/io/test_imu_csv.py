@@ -5,6 +5,7 @@ import pytest
 from hypothesis import given, settings
 from io_strategies import SEEDS, STAMPS
 
+from poet_loc.core.input_error import InputError
 from poet_loc.core.records import ImuSamples
 from poet_loc.io.imu_csv import read_imu, write_imu
 
@@ -75,3 +76,12 @@ def test_shared_logs(shared_data):
         imu = read_imu(file)
         assert imu.stamps_ns.tolist() == [int(row.split(",")[0]) for row in file.read_text().splitlines()[1:]]
         assert 9 < np.median(np.linalg.norm(imu.specific_force, axis=1)) < 11
+
+
+def test_a_file_whose_end_was_filled_with_zero_bytes_is_one_short_line(tmp_path):
+    """As a logger's disk leaves it when the power goes."""
+    path = tmp_path / "imu.csv"
+    path.write_bytes(f"{HEADER}{ROW}".encode()[:-3] + bytes(3000))
+    with pytest.raises(InputError, match=r"imu\.csv:2: column a_RS_S_z holds ") as refused:
+        read_imu(path)
+    assert len(str(refused.value)) < len(str(path)) + 150
