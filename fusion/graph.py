@@ -57,7 +57,7 @@ def run_fixed_lag(problem: Problem, options: FuseOptions) -> FuseResult:
     builder = new_builder(problem.layout, m, chain, options.graph)
     smoother: FixedLagSmoother | None = None
     for keyframe in walk.keyframes():
-        if keyframe.started or smoother is None:
+        if keyframe.started or keyframe.found_again or smoother is None:
             smoother = FixedLagSmoother(builder, options.graph)
             smoother.start(keyframe, walk)
         else:

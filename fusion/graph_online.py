@@ -186,7 +186,7 @@ class GraphEstimator(Estimator):
         walk.cursor[ROWS] = 0
         while (keyframe := walk.next_keyframe(to_the_end=False)) is not None:
             chain = replace(self._chain, stamps_ns=room.imu_stamps[:n], values=room.imu_values[:n])
-            if keyframe.started or self._smoother is None:
+            if keyframe.started or keyframe.found_again or self._smoother is None:
                 builder = new_builder(self.layout, self.memory, chain, self.options.graph)
                 self._smoother = FixedLagSmoother(builder, self.options.graph)
                 self._smoother.start(keyframe, walk)

@@ -10,6 +10,7 @@ from typing import NamedTuple
 import numpy as np
 
 from fusion import memory
+from fusion.ballot import LOST_SIGMA
 from fusion.columns import Columns, Fitted, Rows, read_fitted
 from fusion.compiled import njit
 from fusion.eskf import ACCEPTED, POSITION_ONLY, ROTATION_ONLY, cholesky, whiten
@@ -28,7 +29,7 @@ from fusion.so3_kernels import copy
 # the last stamp with any; 1 where the newest row is to be written again, 1 where an object's bias has just jumped.
 IMU_ROW, NEXT, ROWS, KEYFRAME_NS, HERE, CORRECTED, JUMPED, CURSOR_SIZE = range(8)
 
-ON_THE_WAY, KEYFRAME, STARTED, END = range(4)  # where the filter is
+ON_THE_WAY, KEYFRAME, STARTED, FOUND_AGAIN, END = range(5)  # where the filter is
 
 NO_KERNEL, HUBER, CAUCHY = range(3)
 KERNELS = {"none": NO_KERNEL, "huber": HUBER, "cauchy": CAUCHY}
@@ -66,7 +67,7 @@ def filter_until_keyframe(
     rows: Rows,
 ) -> int:
     """Filter up to the next keyframe and return KEYFRAME, STARTED where the filter (re)started or put an object
-    elsewhere there, or END.
+    elsewhere there, FOUND_AGAIN where it hardly knew its place before, or END.
 
     A keyframe is due where `spacing` says so, where an object's bias jumped, wherever odometry is measured, and where
     it carries the state over what is not known (from a detection's keyframe to itself there is no noise). Its own
@@ -99,6 +100,7 @@ def _go_to_measurements(
     last = end_of_stamp(log.stamps, first, len(log.stamps))
     restarts, tracked = c[RESTARTS] + c[REPLACED], c[MODE] == TRACKING
     advance(m, w, log.imu_stamps, log.imu_values, log.stamps[first])
+    unsure = max(m.P[3, 3], m.P[4, 4], m.P[5, 5]) > m.start[LOST_SIGMA] ** 2
     find_rate(m, w, log.imu_stamps, log.imu_values)
     measure(m, w, log, first, last)
     cursor[HERE], cursor[NEXT] = first, last
@@ -116,6 +118,8 @@ def _go_to_measurements(
     cursor[JUMPED] = 1 if _find_fresh(m, fresh) else 0
     if not tracked or c[RESTARTS] + c[REPLACED] != restarts:
         return STARTED
+    if unsure:
+        return FOUND_AGAIN
     due = cursor[JUMPED] == 1 or log.kinds[first] == ODOMETRY_STEP or _is_doubted(m, log)
     return KEYFRAME if due or c[NOW] - cursor[KEYFRAME_NS] >= spacing.every_ns else ON_THE_WAY
 
@@ -207,6 +211,8 @@ class Keyframe:
     stamp_ns: int
     started: bool
     """The filter has just started, or started again: what was before does not count."""
+    found_again: bool
+    """The filter was so unsure of its place before this stamp that what is linear there does not hold."""
     forgotten: list[Forgotten]
     """Which biases were at this stamp."""
     between: range
@@ -270,7 +276,7 @@ class Walk:
         first, self.first = self.first, last
         here = int(cursor[HERE]) if last > first and self.columns.stamps[cursor[HERE]] == stamp else last
         forgotten = [self._forgotten(int(half)) for half in np.flatnonzero(self.fresh[1])] if cursor[JUMPED] else []
-        return Keyframe(stamp, event == STARTED, forgotten, range(first, here), range(here, last))
+        return Keyframe(stamp, event == STARTED, event == FOUND_AGAIN, forgotten, range(first, here), range(here, last))
 
     def _forgotten(self, half: int) -> Forgotten:
         layout = self.problem.layout

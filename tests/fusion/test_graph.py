@@ -226,6 +226,24 @@ def test_after_seconds_without_measurements_the_graph_takes_up_again():
     assert np.all(position < 3.0 * np.linalg.norm(causal.sigmas[:, 3:6], axis=1))
 
 
+def test_after_long_without_measurements_the_graph_is_no_surer_of_itself_than_the_filter():
+    """The prediction there is metres off, and linear in nothing."""
+    options = SimulationOptions(duration_s=22.0, seed=1, objects=4, symmetric_objects=0)
+    log = simulate_with_truth(options)[0]
+    poses = log.object_poses[""]
+    seconds = (poses.stamps_ns - poses.stamps_ns[0]) * 1e-9
+    log = replace(log, object_poses={"": poses[(seconds < 8.0) | (seconds > 18.0)]})
+    worst = []
+    for estimator in ("eskf", "graph"):
+        result = fuse(log, FuseOptions(estimator=estimator))
+        later = (result.stamps_ns - poses.stamps_ns[0] > 18_010_000_000) & (
+            result.stamps_ns <= log.T_world_imu.stamps_ns[-1]
+        )
+        truth, _ = log.T_world_imu.interpolate(result.stamps_ns[later])
+        worst.append(pose_nees(result.T_world_imu[later], truth, result.pose_covariances[later]).max())
+    assert worst[1] < 1.2 * worst[0]  # without: 6 times
+
+
 SWITCHES = {
     "extrinsics": Estimate(extrinsics=True),
     "time offset": Estimate(time_offset=True),
