@@ -12,7 +12,6 @@ RANGES: dict[str, tuple[str, ...]] = {
         "noise.stated_scale",
         "camera_noise.position",
         "camera_noise.rotation_deg",
-        "camera_noise.solver_scale",
         "moved.memory_s",
         "imu.noise_scale",
         "odometry.rotation_walk_deg",
@@ -37,6 +36,7 @@ RANGES: dict[str, tuple[str, ...]] = {
         "gap.longest_s",
     ),
     "[0, inf)": (
+        "camera_noise.solver_correlation_s",
         "noise.across",
         "noise.along",
         "noise.floor",

@@ -80,8 +80,8 @@ def pose_problem(
         poses = camera_poses if camera_poses is not None else log.camera_poses
         if poses is None:
             raise InputError("there are no camera poses to fuse", path=log.path, fix="localize first, or fuse objects")
-        scale = 1.0 if camera_poses is None else options.camera_noise.solver_scale
-        measured = camera_measurements(poses, calibration, options, scale)
+        lasting_s = 0.0 if camera_poses is None else options.camera_noise.solver_correlation_s
+        measured = camera_measurements(poses, calibration, options, lasting_s)
     else:
         if log.landmark_map is None:
             raise InputError("there is no landmarks.json", path=log.path, fix="fuse camera poses instead")
@@ -154,16 +154,21 @@ def object_measurements(
 
 
 def camera_measurements(
-    poses: CameraPoses, calibration: Calibration, options: FuseOptions, scale: float = 1.0
+    poses: CameraPoses, calibration: Calibration, options: FuseOptions, lasting_s: float = 0.0
 ) -> Measurements:
-    """Return camera poses as measurements, with the options' noise where they bring none, its 1-sigma times scale."""
+    """Return camera poses as measurements, with the options' noise where they bring none.
+
+    Where their errors last for seconds, the variances are so many times larger that as many poses, taken for white,
+    tell no more than those do.
+    """
     noise = options.camera_noise
     sigma = np.r_[np.full(3, math.radians(noise.rotation_deg)), np.full(3, noise.position)]
     covariances = np.tile(np.diag(sigma**2), (len(poses), 1, 1))
     if poses.covariances is not None:
         given = np.isfinite(poses.covariances).all(axis=(1, 2))
         covariances[given] = poses.covariances[given]
-    covariances *= scale**2
+    if len(poses) > 1:
+        covariances *= 1.0 + 2.0 * lasting_s / (float(np.median(np.diff(poses.stamps_ns))) * 1e-9)
     return Measurements(
         poses.stamps_ns + time_shift_ns(calibration),
         np.full(len(poses), CAMERA_POSE, dtype=np.int64),

@@ -6,11 +6,12 @@ away. The gyroscope tells this from odometry that has lost its way: that one tur
 
 from __future__ import annotations
 
+from fusion.ballot import LOST_SHARE, START_WINDOW_S
 from fusion.columns import Columns
 from fusion.compiled import njit
 from fusion.eskf import POSITION_ONLY
 from fusion.filter_update import LIMIT_ROTATION, is_unsettled
-from fusion.memory import CLONED_AT, NOW, REFUSED_ODOMETRY, UNSURE_AT, Memory, Work
+from fusion.memory import CLONED_AT, NOW, REFUSED_ODOMETRY, UNSURE_AT, VOTE_HEAD, Memory, Work
 from fusion.nav_state import CLONE, EXTRINSIC_ROTATION, POSITION_ERROR
 from fusion.so3_kernels import apply, multiply
 from fusion.starting import start_again_in_place
@@ -22,7 +23,7 @@ TURNS_ALIKE = 3.0
 
 @njit(cache=True)
 def follow_refusals(m: Memory, w: Work, log: Columns, j: int) -> None:
-    """Count odometry's ways refused in a row; too many, and a state unsure of where it is starts again as they move.
+    """Count odometry's ways refused in a row; too many, and a state that nothing else holds starts again as they move.
 
     j is the odometry that was taken last: w holds its residual.
     """
@@ -30,8 +31,21 @@ def follow_refusals(m: Memory, w: Work, log: Columns, j: int) -> None:
         m.counters[REFUSED_ODOMETRY] = 0
     elif log.nis[j, 1] <= TURNS_ALIKE * m.limits[LIMIT_ROTATION]:
         m.counters[REFUSED_ODOMETRY] += 1
-    if m.counters[REFUSED_ODOMETRY] >= IN_A_ROW and is_unsettled(m):
+    if m.counters[REFUSED_ODOMETRY] >= IN_A_ROW and is_unsettled(m) and not _is_held(m):
         _start_again_as_it_moves(m, w)
+
+
+@njit(cache=True)
+def _is_held(m: Memory) -> bool:
+    """Tell whether the poses of the last second bear the state out: then it is odometry that is wrong."""
+    last, used, seen = len(m.vote_stamps) - 1, 0.0, 0
+    while seen < min(m.counters[VOTE_HEAD], last):
+        slot = (m.counters[VOTE_HEAD] - 1 - seen) & last
+        if (m.counters[NOW] - m.vote_stamps[slot]) * 1e-9 > m.start[START_WINDOW_S]:
+            break
+        used += m.used[slot]
+        seen += 1
+    return used > m.start[LOST_SHARE] * seen
 
 
 @njit(cache=True)

@@ -62,7 +62,7 @@ RULES: tuple[Rule[Reader], ...] = (
     Rule("moved.[!r]*", "moved.release", _asked(lambda o: o.moved.release)),
     Rule(_OF_OBJECTS, "--measurements objects", _measurements("objects")),
     Rule("camera_noise.*", "--measurements camera", _measurements("camera")),
-    Rule("camera_noise.solver_scale", "camera poses of the solver", lambda reader: reader.solved),
+    Rule("camera_noise.solver_correlation_s", "camera poses of the solver", lambda reader: reader.solved),
     Rule("camera_noise.[!s]*", "camera poses of the log's own", lambda reader: not reader.solved),
     Rule("noise.stated_*", "detections with covariances", lambda reader: reader.stated),
     Rule("bias.[!u]* noise.stated_over", "bias.use", _asked(lambda o: o.bias.use)),

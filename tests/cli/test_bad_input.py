@@ -208,7 +208,10 @@ def test_several_sets_of_detections_need_a_name(log, tmp_path, capsys):
         ("fuse LOG --out RUN --odometry.step-s 1", ["odometry.step-s", "odometry"]),
         ("fuse LOG --out RUN --measurements camera --noise.across 0.1", ["noise.across", "measurements objects"]),
         ("fuse LOG --out RUN --measurements camera --noise-from n.yaml", ["--noise-from", "no object poses"]),
-        ("fuse LOG --out RUN --camera-noise.solver-scale 3", ["camera-noise.solver-scale", "measurements camera"]),
+        (
+            "fuse LOG --out RUN --camera-noise.solver-correlation-s 3",
+            ["camera-noise.solver-correlation-s", "measurements camera"],
+        ),
         ("fuse LOG --out RUN --prior.map-position 1", ["prior.map-position", "approximate"]),
         ("fuse LOG --out RUN --mode prev", ["mode prev", "no camera poses"]),
         ("run LOG --out RUN --fusions graph/objects --fusion.moved.then re-estimate", ["moved.then", "eskf"]),
