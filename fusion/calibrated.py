@@ -55,10 +55,8 @@ class Calibrated:
         if self.T_imu_cam is not None and self.extrinsic_covariance is not None:
             sigma = np.sqrt(np.maximum(np.diag(self.extrinsic_covariance), 0.0))
             found["T_imu_cam"] = self.T_imu_cam.as_matrix().tolist()
-            found["rotation_sigma_deg"], found["translation_sigma_m"] = (
-                np.degrees(sigma[:3]).tolist(),
-                sigma[3:].tolist(),
-            )
+            found["rotation_sigma_deg"] = np.degrees(sigma[:3]).tolist()
+            found["translation_sigma_m"] = sigma[3:].tolist()
         if self.timeshift_cam_imu_s is not None:
             found["timeshift_cam_imu_s"], found["timeshift_sigma_s"] = self.timeshift_cam_imu_s, self.timeshift_sigma_s
         if self.gravity is not None and self.gravity_sigma is not None:

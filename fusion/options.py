@@ -39,7 +39,7 @@ class CameraNoise:
     """1-sigma of rotation per axis, deg."""
     solver_correlation_s: float = 2.4
     """The errors of the solver's own poses last so long, s. A filter that takes them for white believes itself too
-    much, so their 1-sigma is larger by the square root of 1 + twice that time in poses: by 12 at 30 Hz. 0: white."""
+    much, so their 1-sigma is larger by about the square root of twice that time in poses: by 12 at 30 Hz. 0: white."""
 
 
 @dataclass(frozen=True)

@@ -158,8 +158,9 @@ def camera_measurements(
 ) -> Measurements:
     """Return camera poses as measurements, with the options' noise where they bring none.
 
-    Where their errors last for seconds, the variances are so many times larger that as many poses, taken for white,
-    tell no more than those do.
+    Where their errors are a Gauss-Markov process of this correlation time, s, the variances are so many times larger
+    that as many poses, taken for white, tell no more: (1 + phi) / (1 - phi), phi being what is left of an error at the
+    next pose.
     """
     noise = options.camera_noise
     sigma = np.r_[np.full(3, math.radians(noise.rotation_deg)), np.full(3, noise.position)]
@@ -167,8 +168,9 @@ def camera_measurements(
     if poses.covariances is not None:
         given = np.isfinite(poses.covariances).all(axis=(1, 2))
         covariances[given] = poses.covariances[given]
-    if len(poses) > 1:
-        covariances *= 1.0 + 2.0 * lasting_s / (float(np.median(np.diff(poses.stamps_ns))) * 1e-9)
+    stamps = np.unique(poses.stamps_ns)
+    if lasting_s > 0.0 and len(stamps) > 1:
+        covariances /= np.tanh(0.5e-9 * np.median(np.diff(stamps)) / lasting_s)
     return Measurements(
         poses.stamps_ns + time_shift_ns(calibration),
         np.full(len(poses), CAMERA_POSE, dtype=np.int64),

@@ -14,7 +14,7 @@ from fusion.filter_update import LIMIT_ROTATION, is_unsettled
 from fusion.memory import CLONED_AT, NOW, REFUSED_ODOMETRY, UNSURE_AT, VOTE_HEAD, Memory, Work
 from fusion.nav_state import CLONE, EXTRINSIC_ROTATION, POSITION_ERROR
 from fusion.so3_kernels import apply, multiply
-from fusion.starting import start_again_in_place
+from fusion.starting import first_vote, start_again_in_place, used_since
 
 IN_A_ROW = 3
 TURNS_ALIKE = 3.0
@@ -23,7 +23,7 @@ TURNS_ALIKE = 3.0
 
 @njit(cache=True)
 def follow_refusals(m: Memory, w: Work, log: Columns, j: int) -> None:
-    """Count odometry's ways refused in a row; too many, and a state that nothing else holds starts again as they move.
+    """Count odometry's ways refused in a row; too many, and a state that nothing else holds starts again.
 
     j is the odometry that was taken last: w holds its residual.
     """
@@ -38,14 +38,8 @@ def follow_refusals(m: Memory, w: Work, log: Columns, j: int) -> None:
 @njit(cache=True)
 def _is_held(m: Memory) -> bool:
     """Tell whether the poses of the last second bear the state out: then it is odometry that is wrong."""
-    last, used, seen = len(m.vote_stamps) - 1, 0.0, 0
-    while seen < min(m.counters[VOTE_HEAD], last):
-        slot = (m.counters[VOTE_HEAD] - 1 - seen) & last
-        if (m.counters[NOW] - m.vote_stamps[slot]) * 1e-9 > m.start[START_WINDOW_S]:
-            break
-        used += m.used[slot]
-        seen += 1
-    return used > m.start[LOST_SHARE] * seen
+    first = first_vote(m, m.start[START_WINDOW_S], 0)
+    return used_since(m, first) > m.start[LOST_SHARE] * (m.counters[VOTE_HEAD] - first)
 
 
 @njit(cache=True)

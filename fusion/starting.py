@@ -164,7 +164,7 @@ def _write_variances(m: Memory, k: int, p_co: Array, covariance: Array, vote: Ar
 
 
 @njit(cache=True)
-def _first_vote(m: Memory, window_s: float, wanted: int) -> int:
+def first_vote(m: Memory, window_s: float, wanted: int) -> int:
     """Return where the votes of the window start; a window with fewer than wanted votes reaches further back.
 
     None reaches back to before the state lost its attitude.
@@ -180,6 +180,15 @@ def _first_vote(m: Memory, window_s: float, wanted: int) -> int:
             break
         first -= 1
     return first
+
+
+@njit(cache=True)
+def used_since(m: Memory, first: int) -> float:
+    """Return how many of the votes since `first` the filter took the position in of."""
+    used = 0.0
+    for a in range(first, m.counters[VOTE_HEAD]):
+        used += m.used[a & (len(m.vote_stamps) - 1)]
+    return used
 
 
 @njit(cache=True)
@@ -247,7 +256,7 @@ def _agree_with_given_pose(m: Memory, w: Work) -> None:
 @njit(cache=True)
 def _found_by_votes(m: Memory, w: Work) -> bool:
     """Tell whether enough votes agree and have no rival; leave their correction to `adopt`."""
-    first = _first_vote(m, m.start[START_WINDOW_S], 2 * int(m.start[MIN_VOTES]))
+    first = first_vote(m, m.start[START_WINDOW_S], 2 * int(m.start[MIN_VOTES]))
     count, span, objects, alike = _agreement(m, w, first, False)
     total = m.counters[VOTE_HEAD] - first
     if count < max(m.start[MIN_VOTES], m.start[MIN_SHARE] * total):
@@ -267,12 +276,10 @@ def restart_if_lost(m: Memory, w: Work) -> None:
     """Start again where hardly anything of late was accepted and what was refused agrees with itself."""
     since_start = (m.counters[NOW] - m.counters[STARTED_AT]) * 1e-9
     window = min(m.start[LOST_WINDOW_S], max(m.start[START_WINDOW_S], since_start))  # a wrong start is mended soon
-    first, head = _first_vote(m, window, int(m.start[LOST_MIN_VOTES])), m.counters[VOTE_HEAD]
+    first, head = first_vote(m, window, int(m.start[LOST_MIN_VOTES])), m.counters[VOTE_HEAD]
     if head - first < m.start[LOST_MIN_VOTES]:
         return
-    used = 0.0
-    for a in range(first, head):
-        used += m.used[a & (len(m.vote_stamps) - 1)]
+    used = used_since(m, first)
     if used > m.start[LOST_SHARE] * (head - first):
         return
     m.up[0], m.up[1], m.up[2] = 0.0, 0.0, 1.0
