@@ -164,7 +164,8 @@ def top_view_figure(record: RunRecord) -> Figure:
             paths.insert(0, (record.references[body], _TRUTH_STYLE))
         paths = [(trajectory, style) for trajectory, style in paths if len(trajectory)]
         for trajectory, style in paths:
-            x, y = _thinned(trajectory).T_world_body.translation.T[:2]
+            shown = _thinned(trajectory)
+            _, x, y = broken(shown.stamps_ns * 1e-9, *shown.T_world_body.translation.T[:2])
             panel.plot(x, y, **style)
             panel.plot(x[0], y[0], "o", color=style["color"], markersize=5, markerfacecolor="white", zorder=20)
             panel.plot(x[-1], y[-1], "s", color=style["color"], markersize=4, zorder=20)

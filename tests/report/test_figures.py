@@ -19,7 +19,7 @@ from poet_loc.core.input_error import InputError
 from poet_loc.report import figure_style
 from poet_loc.report import figures as figures_module
 from poet_loc.report.evaluate import ERROR_AXES
-from poet_loc.report.figures import draw_run, error_figure, trajectory_figure, write_figures
+from poet_loc.report.figures import draw_run, error_figure, top_view_figure, trajectory_figure, write_figures
 from poet_loc.report.run_record import ACCEPTED, POSITION_ONLY, REFUSED, ROTATION_ONLY, RunRecord
 
 EXPECTED = {
@@ -117,6 +117,18 @@ def test_lines_do_not_bridge_gaps() -> None:
     assert np.isnan(at).tolist() == [False, False, False, True, False, False]
     assert np.isnan(values[3])
     assert figure_style.broken(seconds[:1], seconds[:1])[0].tolist() == [0.0]
+
+
+def test_no_path_from_above_bridges_a_gap(run_record: RunRecord) -> None:
+    whole = run_record.estimates[-1].trajectory
+    count = len(whole)
+    silent = whole[np.r_[: count // 3, 2 * count // 3 : count]]
+    estimate = replace(run_record.estimates[-1], trajectory=silent)
+    panel = top_view_figure(replace(run_record, estimates=(estimate,))).axes[-1]
+    drawn = next(line for line in panel.lines if line.get_label() == estimate.name)
+    gap = np.flatnonzero(np.isnan(np.asarray(drawn.get_xdata(), dtype=float)))
+    assert gap.tolist() == [count // 3]
+    np.testing.assert_allclose(np.asarray(drawn.get_xdata())[-1], silent.T_world_body.translation[-1, 0])
 
 
 def test_decisions_of_gate_and_votes(run_record: RunRecord) -> None:
