@@ -18,7 +18,7 @@ from dataclasses import dataclass, replace
 from typing import Any, SupportsIndex
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from fusion import memory
@@ -31,7 +31,7 @@ from fusion.graph_walk import HERE, IMU_ROW, NEXT, ROWS, Walk
 from fusion.imu_noise import REACH, follow_noise
 from fusion.measurements import Measurements
 from fusion.nav_state import StateLayout
-from fusion.online import Estimator, Health, OnlineOptions, empty_problem
+from fusion.online import Estimator, Health, OnlineOptions
 from fusion.options import FuseOptions
 from fusion.prepare import Problem
 from poet_loc.core.records import Calibration, ImuSamples, LandmarkMap
@@ -56,7 +56,8 @@ class _Kept:
 class GraphEstimator(Estimator):
     """The fixed-lag graph on an IMU, fed one sample at a time; the horizon for what comes late is `graph.lag_s`.
 
-    Takes what `online.Estimator` takes. Raises InputError where calibration or map lack what the filter needs.
+    Takes what `online.Estimator` takes; IMU samples must come in order. Raises InputError where calibration or map lack
+    what the filter needs.
     """
 
     def __init__(
@@ -68,11 +69,9 @@ class GraphEstimator(Estimator):
         layout: StateLayout | None = None,
     ) -> None:
         options = replace(options or FuseOptions(), estimator="graph")
-        self._problem = empty_problem(calibration, landmark_map, options, layout)
         super().__init__(calibration, landmark_map, options, online, layout)
 
-    def reset(self) -> None:
-        """Forget everything that was fed."""
+    def _begin(self) -> None:
         self._lag_ns = round(self.options.graph.lag_s * 1e9)
         self._snapshot_ns = max(1, round(self.online.snapshot_s * 1e9))
         self._ahead_ns = round(self.online.ahead_s * 1e9)
@@ -84,7 +83,6 @@ class GraphEstimator(Estimator):
         self._room, self._walk.out = loop_columns(_room_for(self._problem, samples, poses))
         self._fitted = Fitted(np.zeros((poses, 9)), np.zeros((poses, 6, 6)), np.ones((poses, 3)), np.zeros(poses))
         self._samples = self._poses = 0
-        self._rate, self._force = np.zeros(3), np.zeros(3)
         self._chain = MotionChain.of(self._problem, self.options)
         self._smoother: FixedLagSmoother | None = None
         self._newest: FixedLagSmoother | None = None
@@ -93,11 +91,9 @@ class GraphEstimator(Estimator):
         self._overflowed = self._replays = 0
         self._odometry: tuple[int, Array, Array] | None = None
 
-    def feed_imu(self, stamp_ns: SupportsIndex, angular_velocity: ArrayLike, specific_force: ArrayLike) -> None:
-        """Take in one IMU sample: (3,) rad/s and (3,) m/s^2 in imu axes; they must come in order."""
-        stamp, values = operator.index(stamp_ns), np.concatenate([angular_velocity, specific_force]).astype(float)
+    def _feed_sample(self, stamp: int, rate: Array, force: Array) -> None:
         newest = int(self._room.imu_stamps[self._samples - 1]) if self._samples else stamp - 1
-        if not np.isfinite(values).all():
+        if not np.isfinite([*rate, *force]).all():
             self._malformed += 1
         elif stamp == newest:
             self._duplicates += 1
@@ -107,7 +103,7 @@ class GraphEstimator(Estimator):
             if self._samples == len(self._room.imu_stamps):
                 self._trim()
             n = self._samples
-            self._room.imu_stamps[n], self._room.imu_values[n, :6] = stamp, values
+            self._room.imu_stamps[n], self._room.imu_values[n, :3], self._room.imu_values[n, 3:6] = stamp, rate, force
             follow_noise(self._room.imu_stamps, self._room.imu_values, n, n + 1)
             self._samples += 1
             self._run()
@@ -125,6 +121,7 @@ class GraphEstimator(Estimator):
             self._overflowed,
             self._not_in_map,
             self._replays,
+            self._clock_jumps,
             self._object_health(),
         )
 

@@ -24,6 +24,7 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from fusion import memory, replay, replay_memory
 from fusion.bias_spread import white_part
+from fusion.calibrated import Calibrated, calibrated
 from fusion.health import Mode, ObjectHealth, mode_of
 from fusion.known_errors import known_errors
 from fusion.measurements import (
@@ -36,6 +37,7 @@ from fusion.measurements import (
 )
 from fusion.motion_source import odometry_spread, scaled_noise
 from fusion.nav_state import ACCEL_BIAS, CORE, GYRO_BIAS, POSITION, VELOCITY, StateLayout
+from fusion.online_input import ImuClock, shaped, vector
 from fusion.options import FuseOptions
 from fusion.place_watch import (
     IN_A_ROW,
@@ -52,6 +54,7 @@ from fusion.prepare import NEAREST_OBJECT, Problem, fill_memory, layout_for, tim
 from poet_loc.core.geometry import make_pose
 from poet_loc.core.input_error import InputError, within
 from poet_loc.core.records import Calibration, ImuSamples, LandmarkMap
+from poet_loc.io.pose_columns import not_positive_definite
 
 Array = NDArray[np.float64]
 _NO_OBJECT = np.array([-1])
@@ -71,10 +74,13 @@ class OnlineOptions:
     """The buffers hold the horizon at this rate of the IMU, Hz; above it the horizon shrinks."""
     max_pose_rate_hz: float = 1000.0
     """The buffers hold so many poses per second, over all objects, Hz; what does not fit is refused and counted."""
+    clock_set_s: float = 0.5
+    """Where all samples of the IMU were too late for so long, s, its clock was set back: what was fed is forgotten."""
 
     def __post_init__(self) -> None:
         within("(0, inf)", self, "snapshot_s", "max_imu_rate_hz", "max_pose_rate_hz")
         within("[0, inf)", self, "horizon_s", "ahead_s")
+        within("(0, inf]", self, "clock_set_s")
 
 
 @dataclass(frozen=True)
@@ -124,13 +130,15 @@ class Health:
     too_early: int
     """Further ahead of the IMU than allowed: refused."""
     malformed: int
-    """With numbers that are not finite: refused."""
+    """With numbers that are not finite, or a covariance that is not positive definite: refused."""
     overflowed: int
     """Did not fit into the buffers: refused."""
     not_in_map: int
     """Of objects that are not in the map, or behind the camera: ignored."""
     replays: int
     """How often something late was put in its place."""
+    clock_jumps: int
+    """How often the IMU's clock was set back and all before forgotten, these counts too."""
     objects: dict[tuple[int, int], ObjectHealth]
     """By (object_id, instance); (-1, 0) for camera poses."""
 
@@ -140,7 +148,8 @@ class Estimator:
 
     options.measurements says whether poses of objects (needs the map) or of the camera come in, options.motion
     (imu+odometry) whether odometry comes in beside the IMU; layout switches states
-    on beyond what the options ask for. Raises InputError where calibration or map lack what the filter needs.
+    on beyond what the options ask for. Raises InputError where calibration or map lack what the filter needs. It has no
+    locks: calls from several threads need one around each.
     The first call compiles or loads the kernels: construct it, which does that, before the loop runs.
     """
 
@@ -157,7 +166,7 @@ class Estimator:
         self.layout, self.keys = problem.layout, problem.keys
         self._floats, self._integers = fill_memory(problem, self.options)
         self.memory = memory.views.py_func(self._floats, self._integers)
-        self._shift_ns = time_shift_ns(calibration)
+        self._problem, self._shift_ns = problem, time_shift_ns(calibration)
         self._landmarks = _landmark_numbers(self.keys)
         self._known_errors = known_errors(self.options.bias, landmark_map)
         noise = self.options.camera_noise
@@ -169,6 +178,11 @@ class Estimator:
 
     def reset(self) -> None:
         """Forget everything that was fed."""
+        self._clock = ImuClock(round(self.online.horizon_s * 1e9), self.online.clock_set_s * 1e9)
+        self._clock_jumps = 0
+        self._begin()
+
+    def _begin(self) -> None:
         o = self.online
         self._floats[: len(self._first_state)] = self._first_state
         self.memory.counters[:] = 0
@@ -189,10 +203,20 @@ class Estimator:
         self._feed(replay.POSES, 0, 0)
 
     def feed_imu(self, stamp_ns: SupportsIndex, angular_velocity: ArrayLike, specific_force: ArrayLike) -> None:
-        """Take in one IMU sample: (3,) rad/s and (3,) m/s^2 in imu axes."""
-        self._rate[:] = angular_velocity
-        self._force[:] = specific_force
-        self._feed(replay.IMU_SAMPLE, operator.index(stamp_ns), 1)
+        """Take in one IMU sample: (3,) rad/s and (3,) m/s^2 in imu axes.
+
+        Raises ValueError for other shapes, InputError at the hundredth sample where the stamps are no nanoseconds.
+        """
+        stamp = operator.index(stamp_ns)
+        rate, force = vector("angular_velocity", angular_velocity), vector("specific_force", specific_force)
+        if self._clock.was_set(stamp):
+            self._clock_jumps += 1
+            self._begin()
+        self._feed_sample(stamp, rate, force)
+
+    def _feed_sample(self, stamp: int, rate: Array, force: Array) -> None:
+        self._rate[:], self._force[:] = rate, force
+        self._feed(replay.IMU_SAMPLE, stamp, 1)
 
     def feed_object_poses(
         self,
@@ -207,19 +231,21 @@ class Estimator:
 
         stamp_ns on the camera's clock; object_ids (N,), positions (N, 3) m, quaternions (N, 4) scalar last,
         covariances (N, 6, 6) of [e_r, e_t] in camera axes (None, or a row of NaN: from the options), instances (N,).
-        Objects that are not in the map are ignored and counted. Raises ValueError for a zero quaternion.
+        Of one object, N may be left out. Objects that are not in the map are ignored and counted. Raises ValueError
+        for a zero quaternion and other shapes, InputError where options.measurements is camera.
         """
+        if self.options.measurements != "objects":
+            raise InputError("this estimator fuses camera poses", fix="choose FuseOptions(measurements='objects')")
         ids = np.atleast_1d(np.asarray(object_ids))
-        t = np.asarray(positions, dtype=float).reshape(len(ids), 3)
-        which = np.zeros(len(ids), dtype=np.int64) if instances is None else np.atleast_1d(np.asarray(instances))
+        t, q = shaped("positions", positions, len(ids), 3), shaped("q_xyzw", q_xyzw, len(ids), 4)
+        stated = None if covariances is None else shaped("covariances", covariances, len(ids), 6, 6)
+        which = np.zeros(len(ids)) if instances is None else shaped("instances", instances, len(ids))
         landmarks = np.array(
             [self._landmarks.get((int(i), int(k)), self._landmarks.get((int(i), -1), -1)) for i, k in zip(ids, which)],
             dtype=np.int64,
         )
         usable = (landmarks >= 0) & ~(t[:, 2] <= NEAREST_OBJECT)
         self._not_in_map += int(len(ids) - np.count_nonzero(usable))
-        q = np.asarray(q_xyzw, dtype=float).reshape(len(ids), 4)
-        stated = None if covariances is None else np.asarray(covariances, dtype=float).reshape(len(ids), 6, 6)
         if not usable.all():
             landmarks, q, t = landmarks[usable], q[usable], t[usable]
             stated = None if stated is None else stated[usable]
@@ -232,11 +258,13 @@ class Estimator:
         """Take in a camera pose T_world_cam.
 
         stamp_ns on the camera's clock, position (3,) m, quaternion (4,) scalar last, covariance (6, 6) of [e_r, e_t]
-        with R = R_true Exp(e_r), t = t_true + e_t (None: from the options). Raises ValueError for a zero quaternion.
+        with R = R_true Exp(e_r), t = t_true + e_t (None: from the options). Raises ValueError for a zero quaternion
+        and other shapes.
         """
-        R = self._camera_covariance if covariance is None else np.asarray(covariance, dtype=float)
-        q, t = np.asarray(q_xyzw, dtype=float).reshape(1, 4), np.asarray(position, dtype=float).reshape(1, 3)
-        self._feed_poses(stamp_ns, CAMERA_POSE, _NO_OBJECT, q, t, R.reshape(1, 6, 6))
+        R = shaped("covariance", self._camera_covariance if covariance is None else covariance, 1, 6, 6)
+        q, t = shaped("q_xyzw", q_xyzw, 1, 4), shaped("position", position, 1, 3)
+        R = np.where(not_positive_definite(R)[:, None, None], np.nan, R)
+        self._feed_poses(stamp_ns, CAMERA_POSE, _NO_OBJECT, q, t, R)
 
     def feed_odometry(self, stamp_ns: SupportsIndex, position: ArrayLike, q_xyzw: ArrayLike) -> None:
         """Take in a camera pose T_odom_cam of odometry, of which only the motion since earlier ones is used.
@@ -296,8 +324,13 @@ class Estimator:
             int(h[replay_memory.OVERFLOWED]),
             self._not_in_map,
             int(h[replay_memory.REPLAYS]),
+            self._clock_jumps,
             self._object_health(),
         )
+
+    def calibrated(self) -> Calibrated | None:
+        """Return what options.estimate switches on, as it is known at the newest IMU sample; None if nothing is."""
+        return calibrated(self.memory, self._problem)
 
     def _mode(self) -> Mode:
         m, c = self.memory, self.memory.counters
@@ -331,7 +364,8 @@ class Estimator:
             return ray_aligned_covariance(places, noise.across, noise.along, sigma, noise.floor)
         given = covariances.copy()
         stated = np.isfinite(given).all(axis=(1, 2))
-        given[stated] = white_part(given[stated], places[stated], noise, self.options.bias)
+        white = white_part(given[stated], places[stated], noise, self.options.bias)
+        given[stated] = np.where(not_positive_definite(given[stated])[:, None, None], np.nan, white)
         if stated.all():
             return given
         R = ray_aligned_covariance(places, noise.across, noise.along, sigma, noise.floor)

@@ -24,6 +24,7 @@ from fusion.scatter import LAST_NS, usual_scatter
 from poet_loc.core.consistency import chi_square_quantile
 from poet_loc.core.input_error import InputError
 from poet_loc.core.records import Calibration, CameraPoses, ImuNoise, ImuSamples, LandmarkMap, ObjectPoses
+from poet_loc.core.stamp_unit import FASTEST_CAMERA_HZ, FASTEST_IMU_HZ, refuse_other_units
 from poet_loc.io.log_folder import Log
 
 Array = NDArray[np.float64]
@@ -72,7 +73,7 @@ def pose_problem(
 ) -> Problem:
     """Return what the options ask to be fused of a log.
 
-    Raises InputError where motion, calibration, map or poses are missing.
+    Raises InputError where motion, calibration, map or poses are missing, or stamps are no nanoseconds.
     """
     calibration = log.calibration or Calibration()
     layout = layout_for(log.landmark_map, options)
@@ -87,6 +88,9 @@ def pose_problem(
             raise InputError("there is no landmarks.json", path=log.path, fix="fuse camera poses instead")
         detections = object_poses if object_poses is not None else log.detections(None)[1]
         measured = object_measurements(detections, log.landmark_map, calibration, options, log.path)
+    refuse_other_units(measured.stamps_ns, FASTEST_CAMERA_HZ, log.path)
+    if log.imu is not None:
+        refuse_other_units(log.imu.stamps_ns, FASTEST_IMU_HZ, log.path / "imu.csv")
     source = motion_source(log, calibration, options, measured.stamps_ns)
     if source.kind == "imu+odometry":
         layout = replace(layout, clone=True)

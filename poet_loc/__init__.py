@@ -9,6 +9,7 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from fusion.graph_online import GraphEstimator
     from fusion.online import Estimator, OnlineOptions, OnlineState
     from fusion.options import FuseOptions
     from landmarks.localize import LocalizeOptions
@@ -28,6 +29,7 @@ __all__ = [
     "EvaluateOptions",
     "FuseOptions",
     "FusedTrajectory",
+    "GraphEstimator",
     "InputError",
     "LandmarkMap",
     "Localization",
@@ -53,6 +55,7 @@ _HOMES = {
     "poet_loc.io.landmarks_json": ("read_landmarks",),
     "poet_loc.io.log_folder": ("Log", "read_log"),
     "poet_loc.report.evaluate": ("EvaluateOptions",),
+    "fusion.graph_online": ("GraphEstimator",),
     "fusion.online": ("Estimator", "OnlineOptions", "OnlineState"),
     "fusion.options": ("FuseOptions",),
     "landmarks.localize": ("LocalizeOptions",),

@@ -121,7 +121,7 @@ def _mean_force(imu: ImuSamples, body: Trajectory) -> Array | None:
 
 def _force_at(imu: ImuSamples, stamps_ns: NDArray[np.int64], width_s: float = 0.05) -> Array:
     """Return the mean specific force about each stamp, (N, 3)."""
-    size = max(1, round(width_s * 1e9 / float(np.median(np.diff(imu.stamps_ns)))))
+    size = min(len(imu), max(1, round(width_s * 1e9 / float(np.median(np.diff(imu.stamps_ns))))))
     total = np.vstack([np.zeros(3), np.cumsum(imu.specific_force, axis=0)])
     first = np.clip(np.searchsorted(imu.stamps_ns, stamps_ns) - size // 2, 0, len(imu) - size)
     return np.asarray((total[first + size] - total[first]) / size)

@@ -9,9 +9,10 @@ import numpy as np
 
 from poet_loc.check.finding import Evidence, Finding
 from poet_loc.check.streams import Stream, streams_of, with_stamps
+from poet_loc.core.stamp_unit import FASTEST_CAMERA_HZ, FASTEST_IMU_HZ
 from poet_loc.io.log_folder import Log
 
-_FASTEST_IMU_HZ, _FASTEST_CAMERA_HZ, _SLOWEST_HZ = 20_000.0, 2_000.0, 0.02
+_SLOWEST_HZ = 0.02
 _GAP_IMU_INTERVALS, _GAP_IMU_S, _GAP_CAMERA_S = 5.0, 0.04, 8.0
 _JITTER_SHARE = 0.25  # of the median interval, typical deviation
 _RATE_TOLERANCE = 0.1
@@ -32,7 +33,7 @@ def check_stamps(log: Log) -> Iterator[Finding]:
 
 def _unit(stream: Stream) -> Iterator[Finding]:
     rate = 1.0 / float(np.median(stream.intervals_s))
-    fastest = _FASTEST_IMU_HZ if stream.on_imu_clock else _FASTEST_CAMERA_HZ
+    fastest = FASTEST_IMU_HZ if stream.on_imu_clock else FASTEST_CAMERA_HZ
     if _SLOWEST_HZ <= rate <= fastest:
         return
     unit = next((name for name, ns in _UNITS_NS.items() if 1.0 <= rate / ns <= 1500.0), None)

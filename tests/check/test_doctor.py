@@ -191,3 +191,14 @@ def test_odometry_that_is_slow_has_no_breaks(every) -> None:
 
 def test_odometry_is_expected_to_be_as_fusion_expects_it():
     assert expected_of(FuseOptions()) == EXPECTED
+
+
+def test_stamps_of_whole_seconds_end_in_findings_and_not_in_a_traceback(good_log, tmp_path) -> None:
+    """So few samples are left that they fill no twentieth of a second."""
+    write_log(tmp_path, replace(good_log, T_world_imu=None, T_world_cam=None))
+    for name in ("imu.csv", "object_poses.csv"):
+        header, *rows = (tmp_path / name).read_text().splitlines()
+        cells = [row.split(",", 1) for row in rows]
+        rows = [f"{int(stamp) // 10**9},{rest}" for stamp, rest in cells]
+        (tmp_path / name).write_text("\n".join([header, *rows]) + "\n")
+    assert {"stamps-duplicate", "stamp-unit"} <= names(diagnose(tmp_path).findings)

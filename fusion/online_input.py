@@ -1,0 +1,72 @@
+"""What is looked at before an online estimator takes it in: the shapes of arrays, the clock of the IMU."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from poet_loc.core.input_error import InputError
+from poet_loc.core.stamp_unit import FASTEST_IMU_HZ
+
+_FIRST = 100  # samples that tell the unit of the stamps
+
+
+def shaped(name: str, values: ArrayLike, *shape: int) -> NDArray[np.float64]:
+    """Return values as floats of a shape (N, ..); where N is 1, that dimension may be missing.
+
+    Raises ValueError for any other shape, also one of as many numbers: it would be read across.
+    """
+    given = np.asarray(values, dtype=float)
+    if given.shape == shape or (given.shape == (0,) and shape[0] == 0):
+        return given.reshape(shape)
+    if shape[0] == 1 and given.shape == shape[1:]:
+        return given[None]
+    raise ValueError(f"{name} must have the shape {shape}, not {given.shape}")
+
+
+def vector(name: str, values: ArrayLike) -> NDArray[np.float64]:
+    """Return three numbers as floats; raises ValueError for any other shape."""
+    given = np.asarray(values, dtype=float)
+    if given.shape != (3,):
+        raise ValueError(f"{name} must have the shape (3,), not {given.shape}")
+    return given
+
+
+class ImuClock:
+    """Notices stamps that are no nanoseconds, and a clock that was set back.
+
+    After a stamp far ahead, or when a recording is played again, every sample is older than the horizon: where all are
+    so for `set_after_ns`, what came before is of another clock.
+    """
+
+    def __init__(self, horizon_ns: int, set_after_ns: float) -> None:
+        self._horizon_ns, self._set_after_ns = horizon_ns, set_after_ns
+        self._newest_ns: int | None = None
+        self._late_since_ns: int | None = None
+        self._span_ns, self._count = (0, 0), 0
+
+    def was_set(self, stamp_ns: int) -> bool:
+        """Take in the stamp of a sample and tell whether it is the first after the clock was set back.
+
+        Raises InputError, once, where the first samples came faster than those of any IMU.
+        """
+        if self._count < _FIRST:
+            self._look_at_unit(stamp_ns)
+        if self._newest_ns is None or stamp_ns >= self._newest_ns - self._horizon_ns:
+            self._newest_ns = stamp_ns if self._newest_ns is None else max(self._newest_ns, stamp_ns)
+            self._late_since_ns = None
+            return False
+        if self._late_since_ns is None or stamp_ns < self._late_since_ns:
+            self._late_since_ns = stamp_ns
+        if stamp_ns - self._late_since_ns < self._set_after_ns:
+            return False
+        self._newest_ns, self._late_since_ns = stamp_ns, None
+        return True
+
+    def _look_at_unit(self, stamp_ns: int) -> None:
+        earliest, latest = self._span_ns if self._count else (stamp_ns, stamp_ns)
+        self._span_ns, self._count = (min(earliest, stamp_ns), max(latest, stamp_ns)), self._count + 1
+        seconds = (self._span_ns[1] - self._span_ns[0]) * 1e-9
+        if self._count == _FIRST and seconds < _FIRST / FASTEST_IMU_HZ:
+            what = f"{_FIRST} samples of the IMU within {seconds:.2g} s"
+            raise InputError(what, fix="give stamps in whole nanoseconds")
