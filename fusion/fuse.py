@@ -15,6 +15,7 @@ from fusion.calibrated import calibrated
 from fusion.coarse_offset import with_coarse_offset
 from fusion.columns import OUT_CORE, OUT_COVARIANCE, OUT_SIGMA, Columns, Rows
 from fusion.eskf import POSITION_ONLY, ROTATION_ONLY
+from fusion.first_map import with_first_map
 from fusion.health import run_health
 from fusion.measurements import ODOMETRY_STEP, Measurements
 from fusion.options import FuseOptions
@@ -37,10 +38,12 @@ def fuse(
     """Fuse a log's camera or object poses with its IMU.
 
     camera_poses stand in for the log's own camera_poses.csv, object_poses for the only detections of the log. Where the
-    time offset is estimated, it begins at what the log's turn rates say if these contradict the calibration.
+    time offset is estimated, it begins at what the log's turn rates say if these contradict the calibration. Where the
+    map is unknown and the log has none, the world is the anchor's, upright by the IMU (`fusion/first_map.py`).
     Raises InputError where the log lacks what the options need, or where the start's conditions are never met.
     """
     options = options or FuseOptions()
+    log, options = with_first_map(log, options, object_poses)
     log = with_coarse_offset(log, options, camera_poses, object_poses)
     problem = pose_problem(log, options, camera_poses, object_poses)
     result = _estimate(problem, options)

@@ -269,7 +269,8 @@ class Estimate:
     """The direction of gravity in the world."""
     map: Literal["known", "approximate", "unknown"] = "known"
     """Object poses: known as they are in the map; approximate: the map with its covariances (or the priors below);
-    unknown: only that of the first object seen, which anchors the world, the others where they are first seen."""
+    unknown: only that of the first object seen, which anchors the world, the others where they are first seen. Without
+    landmarks.json the anchor stands at the origin, upright by the IMU, and gravity's direction is estimated too."""
 
 
 @dataclass(frozen=True)

@@ -195,12 +195,17 @@ def fuse(
     """Fuse a log's object poses, or camera poses, with its IMU (else its odometry, else constant velocity).
 
     detections names object_poses_NAME.csv; solver makes the camera poses where options.measurements is "camera" and
-    the log brings none. Raises InputError where the log lacks what the options need, or where the start's conditions
-    are never met.
+    the log brings none. Where the map is unknown and the log has none, the world is an object's, in which the log's
+    ground truth says nothing. Raises InputError where the log lacks what the options need, or where the start's
+    conditions are never met.
     """
+    from fusion.first_map import lacks_map
     from fusion.fuse import fuse as run
 
-    log, options = _log(log, detections), options or FuseOptions()
+    options = options or FuseOptions()
+    log = _log(log, detections, unmapped=options.estimate.map == "unknown")
+    if lacks_map(log, options):
+        log = replace(log, T_world_cam=None, T_world_imu=None)
     object_poses = camera_poses = name = None
     if options.measurements == "objects" or log.camera_poses is None:
         name, object_poses = log.detections(detections)
@@ -232,8 +237,8 @@ def evaluate(*results: Result, options: EvaluateOptions | None = None) -> Compar
     return Comparison(results, evaluation)
 
 
-def _log(log: Log | str | Path, detections: str | None) -> Log:
-    return log if isinstance(log, Log) else read_log(log, detections)
+def _log(log: Log | str | Path, detections: str | None, unmapped: bool = False) -> Log:
+    return log if isinstance(log, Log) else read_log(log, detections, unmapped)
 
 
 def _with_detections(options: SolverOptions, name: str) -> LocalizeOptions:

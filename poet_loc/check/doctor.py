@@ -89,6 +89,7 @@ def _nothing_seen(log: Log) -> Iterator[Finding]:
     file = "landmarks.json" if log.object_poses else object_poses_file("")
     if not (log.path / file).exists():  # one that cannot be read is told already
         fix = "a log holds object_poses.csv with landmarks.json, or camera_poses.csv"
+        fix += "; fuse --estimate.map unknown makes a map" if log.object_poses else ""
         yield Finding("missing", "error", file, "is not there: nothing can be localised", fix)
 
 

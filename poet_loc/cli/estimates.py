@@ -6,6 +6,8 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, fields, replace
 from typing import Literal
 
+import numpy as np
+
 from fusion.health import troubles
 from fusion.odometry import expected_of
 from fusion.options import FuseOptions
@@ -96,8 +98,12 @@ def estimate_log(
 
     Raises InputError where nothing at all can be estimated; if strict, for the first thing that cannot.
     """
-    name = None
-    if log.object_poses and log.landmark_map is not None:
+    from fusion.first_map import lacks_map
+
+    name, own_world = None, lacks_map(log, options.fusion)
+    if own_world:
+        log = replace(log, T_world_cam=None, T_world_imu=None)
+    if log.object_poses and (log.landmark_map is not None or own_world):
         name = log.detections(detections)[0]
     elif detections is not None or log.camera_poses is None:
         log.detections(detections)
@@ -113,7 +119,13 @@ def estimate_log(
         _tell_of_moved_objects(log, result, report)
     _tell_of_troubles(log, fused, report)
     _tell_of_odometry(log, fused, options.fusion, report)
-    evaluation = evaluate_estimates(log, name, _estimates(log, localized, fused), options.evaluation, report)
+    _tell_of_unused_covariances(log, fused, options.fusion, report)
+    evaluation = None
+    if own_world:
+        what = "no landmarks.json: the world is that of the object that anchors it, in which ground truth says nothing"
+        report.note(f"{log.path}: {what}; poet-loc evaluate --align se3 compares trajectories")
+    else:
+        evaluation = evaluate_estimates(log, name, _estimates(log, localized, fused), options.evaluation, report)
     return Estimates(log, name, localized, fused, evaluation)
 
 
@@ -124,7 +136,7 @@ def _tell_of_moved_objects(log: Log, result: FuseResult, report: Report) -> None
     begin_ns = int(result.health.since_ns[0])
     for key, first, last in result.health.released:
         span = f"left out from {(first - begin_ns) * 1e-9:.1f} s to {(last - begin_ns) * 1e-9:.1f} s"
-        report.note(f"{log.path}: {names[key]} was moved: {span} ({result.name})")
+        report.note(f"{log.path}: {names.get(key, f'object {key[0]}')} was moved: {span} ({result.name})")
 
 
 def _tell_of_troubles(log: Log, fused: Sequence[FuseResult], report: Report) -> None:
@@ -146,6 +158,16 @@ def _tell_of_odometry(log: Log, fused: Sequence[FuseResult], options: FuseOption
     if breaks:
         more = f" and {len(breaks) - _TOLD_BREAKS} more" if len(breaks) > _TOLD_BREAKS else ""
         report.note(f"{log.path}: T_odom_cam.tum has {told}{more}: not taken for motion")
+
+
+def _tell_of_unused_covariances(log: Log, fused: Sequence[FuseResult], options: FuseOptions, report: Report) -> None:
+    """Note a map that says how unsure it is and is taken as exact all the same."""
+    stated = [each.covariance for each in log.landmark_map or () if each.covariance is not None]
+    if not stated or options.estimate.map != "known" or not any(each.name.endswith("/objects") for each in fused):
+        return
+    sigma = 1e3 * np.sqrt(max(np.trace(covariance[3:, 3:]) / 3.0 for covariance in stated))
+    what = f"landmarks.json states 1-sigmas of up to {sigma:.1f} mm, and fusion takes it as exact"
+    report.note(f"{log.path}: {what}; see --estimate.map approximate")
 
 
 def steps(modes: Sequence[Mode] = MODES, fusions: Sequence[Fusion] = FUSIONS) -> int:
@@ -184,7 +206,9 @@ class _Attempt:
         if self.strict:
             raise error
         self.last = error
-        self._left_out.setdefault(str(error), []).append(name)
+        names = self._left_out.setdefault(str(error), [])
+        if name not in names:
+            names.append(name)
 
     def tell(self) -> None:
         for reason, names in self._left_out.items():

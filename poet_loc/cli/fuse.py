@@ -48,7 +48,7 @@ def execute(arguments: Arguments) -> None:
     stages = replace(typed, fusion=options)
     named = () if arguments.detections is None else (arguments.detections,)
     with whole_folder(arguments.out, arguments.overwrite, inputs=[arguments.log]) as folder:
-        log = read_log(arguments.log, arguments.detections)
+        log = read_log(arguments.log, arguments.detections, unmapped=options.estimate.map == "unknown")
         fusions = (fusion_of(options),)
         refuse_unread(typed, [log], (), fusions, named, arguments.noise_from)
         solve = options.measurements == "camera" and log.camera_poses is None

@@ -5,11 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
-import numpy as np
-
 from landmarks.options import MODES
 from poet_loc.cli.arguments import Flat, LogFolder
 from poet_loc.cli.estimates import FUSIONS, Estimates, Fusion, StageOptions, estimate_log, refuse_one_estimator, steps
+from poet_loc.cli.found import found_lines
 from poet_loc.cli.noise_file import with_noise_from
 from poet_loc.cli.run_folder import WRITING_STEPS, error_tables, named_files, write_run
 from poet_loc.cli.terminal import print_tables, progress
@@ -46,7 +45,7 @@ def execute(arguments: Arguments) -> None:
     fusion = with_noise_from(arguments.noise_from, arguments.options.fusion)
     refuse_one_estimator(fusion)
     with whole_folder(arguments.out, arguments.overwrite, inputs=[arguments.log]) as folder:
-        log = read_log(arguments.log, arguments.detections)
+        log = read_log(arguments.log, arguments.detections, unmapped=fusion.estimate.map == "unknown")
         named = () if arguments.detections is None else (arguments.detections,)
         refuse_unread(arguments.options, [log], MODES, arguments.fusions, named, arguments.noise_from)
         stages = replace(arguments.options, fusion=fusion)
@@ -62,7 +61,6 @@ def show(estimates: Estimates, out: Path) -> None:
         print_tables(error_tables(estimates.evaluation))
         print()
     for fused in estimates.fused:
-        for name, value in ({} if fused.calibrated is None else fused.calibrated.as_plain()).items():
-            if name != "T_imu_cam":  # calibration.yaml has it
-                print(f"{fused.name} found {name}: {np.array2string(np.asarray(value), precision=4, separator=', ')}")
+        for line in () if fused.calibrated is None else found_lines(fused.calibrated, estimates.log):
+            print(f"{fused.name} found {line}")
     print("\n".join(named_files(out)))

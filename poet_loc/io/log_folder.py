@@ -24,6 +24,7 @@ Record = TypeVar("Record")
 
 _OBJECT_POSES = "object_poses"
 _FIX = "a log holds object_poses.csv with landmarks.json, or camera_poses.csv"
+_NO_MAP_FIX = f"{_FIX}; fuse --estimate.map unknown makes a map"
 
 
 @dataclass(frozen=True)
@@ -64,16 +65,18 @@ class Log:
         return name, self.object_poses[name]
 
 
-def read_log(path: str | Path, detections: str | None = None) -> Log:
+def read_log(path: str | Path, detections: str | None = None, unmapped: bool = False) -> Log:
     """Read a log folder; of several sets of detections only the named one where a name is given.
 
+    unmapped: object poses without landmarks.json will do, as for an unknown map.
     Raises InputError for a folder that is no log, streams without a common time span, detections of objects that the
     map does not have, and whatever the readers of the files refuse.
     """
     log = read_log_files(path, detections)
-    if log.camera_poses is None and (not log.object_poses or log.landmark_map is None):
-        missing = "landmarks.json" if log.object_poses else "object_poses.csv"
-        raise InputError(f"has no {missing}", path=path, fix=_FIX)
+    if log.camera_poses is None and not log.object_poses:
+        raise InputError("has no object_poses.csv", path=path, fix=_FIX)
+    if log.camera_poses is None and log.landmark_map is None and not unmapped:
+        raise InputError("has no landmarks.json", path=path, fix=_NO_MAP_FIX)
     check_log(log)
     return log
 

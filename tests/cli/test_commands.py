@@ -161,6 +161,10 @@ def test_localize_and_fuse_give_the_rows_of_the_run(run, clean_log, tmp_path):
         assert "T_world_imu.tum" in files(out)
 
 
+def found_place(calibration):
+    return calibration.T_cam_imu.inv().translation
+
+
 def test_fuse_writes_what_it_estimated_beside_the_trajectory(clean_log, tmp_path, capsys):
     asked = ["fuse", str(clean_log), "--out", str(tmp_path / "run"), "--no-pictures"]
     assert main([*asked, "--estimate.extrinsics", "--estimate.time-offset", "--estimate.map", "unknown"]) == 0
@@ -174,7 +178,9 @@ def test_fuse_writes_what_it_estimated_beside_the_trajectory(clean_log, tmp_path
     assert after.camera == before.camera
     told = json.loads((tmp_path / "run" / "calibrated.json").read_text())
     assert told["timeshift_cam_imu_s"] == pytest.approx(after.timeshift_cam_imu_s)
-    assert "fuse/eskf/objects found timeshift_sigma_s: 0.0" in capsys.readouterr().out
+    said = capsys.readouterr().out
+    assert f"fuse/eskf/objects found timeshift_cam_imu {1e3 * after.timeshift_cam_imu_s:.1f} ms, 1-sigma" in said
+    assert f"{1e3 * np.linalg.norm(found_place(after) - found_place(before)):.1f} mm and" in said
     assert 0.0 < told["timeshift_sigma_s"] < 0.02
     found = read_landmarks(tmp_path / "run" / "landmarks.json")
     assert {each.key for each in found} <= {each.key for each in read_landmarks(clean_log / "landmarks.json")}
