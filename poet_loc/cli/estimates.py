@@ -71,12 +71,13 @@ class Estimates:
     def record(self) -> RunRecord:
         """What figures, recordings and files take."""
         calibration = self.log.calibration
+        found = (None if each.calibrated is None else each.calibrated.landmark_map for each in self.fused)
         return RunRecord(
             estimates=_estimates(self.log, self.localized, self.fused),
             references=references_of(self.log),
             evaluation=self.evaluation,
             fused=self.fused,
-            landmark_map=self.log.landmark_map,
+            landmark_map=self.log.landmark_map or next((each for each in found if each is not None), None),
             detections=None if self.detections is None else self.log.object_poses[self.detections],
             voted={result.name: result.estimates.voted for result in self.localized},
             camera=None if calibration is None else calibration.camera,

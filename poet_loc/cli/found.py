@@ -10,14 +10,24 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import RigidTransform
 
 from fusion.calibrated import Calibrated
+from poet_loc.cli.estimates import Estimates
 from poet_loc.core.records import Calibration, LandmarkMap
 from poet_loc.io.log_folder import Log
 
 _ANCHOR_M = 1e-4  # the graph gives its anchor a least variance
 
 
-def found_lines(found: Calibrated, log: Log) -> Iterator[str]:
-    """Yield a line for each of extrinsics, time offset, gravity and map that was estimated."""
+def found_lines(estimates: Estimates) -> list[str]:
+    """Return a line for each of extrinsics, time offset, gravity and map that each estimator was asked for."""
+    return [
+        f"{fused.name} found {line}"
+        for fused in estimates.fused
+        if fused.calibrated is not None
+        for line in _lines(fused.calibrated, estimates.log)
+    ]
+
+
+def _lines(found: Calibrated, log: Log) -> Iterator[str]:
     given, told = log.calibration or Calibration(), found.as_plain()
     if "T_imu_cam" in told:
         yield _extrinsics(found, given, told)

@@ -60,7 +60,4 @@ def show(estimates: Estimates, out: Path) -> None:
     if estimates.evaluation is not None:
         print_tables(error_tables(estimates.evaluation))
         print()
-    for fused in estimates.fused:
-        for line in () if fused.calibrated is None else found_lines(fused.calibrated, estimates.log):
-            print(f"{fused.name} found {line}")
-    print("\n".join(named_files(out)))
+    print("\n".join([*found_lines(estimates), *named_files(out)]))

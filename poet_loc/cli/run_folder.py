@@ -16,6 +16,7 @@ from fusion.health import as_plain
 from fusion.result import FuseResult
 from landmarks.localize import LocalizeResult
 from poet_loc.cli.estimates import Estimates
+from poet_loc.cli.found import found_lines
 from poet_loc.cli.terminal import Report
 from poet_loc.core.records import Calibration
 from poet_loc.io.calibration_yaml import write_calibration
@@ -133,7 +134,7 @@ def _write_pictures(folder: Path, estimates: Estimates, asked: Any, report: Repo
     figures = write_figures(record, folder / "figures", paper)
     tables = [] if estimates.evaluation is None else error_tables(estimates.evaluation)
     title = f"poet-loc on {estimates.log.path.resolve().name}"
-    write_report(folder / "report.html", title, tables, figures, options_text(asked))
+    write_report(folder / "report.html", title, tables, figures, options_text(asked), found_lines(estimates))
     report.step("record for rerun")
     from poet_loc.report.rerun_log import write_recording
 

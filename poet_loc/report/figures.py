@@ -144,7 +144,7 @@ def trajectory_figure(record: RunRecord, body: Body) -> Figure:
     for i, j, axis in _PANELS:
         axes[i, j].set_ylabel(f"{axis} [{'deg' if j else 'm'}]")
         if truth is not None:
-            axes[i, j].set_ylim(*_range(*(line.get_ydata() for line in axes[i, j].lines)))
+            axes[i, j].set_ylim(*_range(*(line.get_ydata() for line in axes[i, j].lines), enough=5.0 if j else 0.1))
     for panel in axes[-1]:
         panel.set_xlabel(_TIME)
     figure.suptitle(f"Pose of the {_BODY_NAMES[body]} in the world", fontsize=9)
@@ -302,15 +302,17 @@ def _marks(estimate: Estimate) -> dict[str, Any]:
     )
 
 
-def _range(truth: Any, *estimates: Any) -> tuple[float, float]:
+def _range(truth: Any, *estimates: Any, enough: float) -> tuple[float, float]:
     """Return the range of the truth and most of each estimate, at most thrice the truth's, and a quarter more.
 
-    So an estimate's gross errors do not shrink everything else.
+    So an estimate's gross errors do not shrink everything else. What hardly moves is given the range of the best, if
+    that is no more than enough.
     """
     least, most = np.nanmin(truth), np.nanmax(truth)
-    span = most - least
-    ends = np.array([np.nanpercentile(each, [1.0, 99.0]) for each in estimates if np.isfinite(each).any()])
-    low, high = (min(least, *ends[:, 0]), max(most, *ends[:, 1])) if len(ends) else (least, most)
+    found = [np.nanpercentile(each, [1.0, 99.0]) for each in estimates if np.isfinite(each).any()]
+    ends = np.array(found or [[least, most]])
+    lows, highs = np.minimum(least, ends[:, 0]), np.maximum(most, ends[:, 1])
+    low, high, span = min(least, *lows), max(most, *highs), max(most - least, min(np.min(highs - lows), enough))
     low, high = max(low, least - span), min(high, most + span)
     margin = 0.25 * span + 1e-3
     return float(low - margin), float(high + margin)

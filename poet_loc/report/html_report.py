@@ -37,14 +37,27 @@ _OF_ALL = {
 }
 
 
-def write_report(path: str | Path, title: str, tables: Sequence[Table], figures: Sequence[Path], options: str) -> None:
-    """Write the page: tables, figures (PNG files, put into the page), and what was asked with which versions."""
-    write_whole_file(path, [report_page(title, tables, figures, options)])
+def write_report(
+    path: str | Path,
+    title: str,
+    tables: Sequence[Table],
+    figures: Sequence[Path],
+    options: str,
+    found: Sequence[str] = (),
+) -> None:
+    """Write the page: tables, figures (PNG files, put into the page), and what was asked with which versions.
+
+    found: lines about what was found beside the trajectories.
+    """
+    write_whole_file(path, [report_page(title, tables, figures, options, found)])
 
 
-def report_page(title: str, tables: Sequence[Table], figures: Sequence[Path], options: str) -> str:
+def report_page(
+    title: str, tables: Sequence[Table], figures: Sequence[Path], options: str, found: Sequence[str] = ()
+) -> str:
     """Return the page as text; figures of single estimates fold away, those of the fusion come first and open."""
     results = [f'<div class="wide">{table_html(table)}</div>' for table in tables]
+    beside = [f"<li>{escape(line)}</li>" for line in found]
     parts = [
         '<!DOCTYPE html>\n<html lang="en">\n<head>\n<meta charset="utf-8">',
         '<meta name="viewport" content="width=device-width, initial-scale=1">',
@@ -52,6 +65,7 @@ def report_page(title: str, tables: Sequence[Table], figures: Sequence[Path], op
         f'<body class="poet-loc">\n<h1>{escape(title)}</h1>',
         "<h2>Errors</h2>",
         *(results or ["<p>No ground truth: no errors.</p>"]),
+        *(["<h2>Found beside the trajectories</h2>\n<ul>", *beside, "</ul>"] if beside else []),
         "<h2>Figures</h2>",
         *_figures(figures),
         f"<h2>Options and versions</h2>\n<pre>{escape(options)}</pre>",

@@ -39,6 +39,7 @@ def test_fuse_makes_the_map_and_says_that_ground_truth_is_of_another_world(bare,
     assert "anchors the world" in said.out
     assert "gravity_m_s2" in json.loads((out / "calibrated.json").read_text())
     assert not (out / "errors.csv").exists()
+    assert "<li>fuse/eskf/objects found 4 landmarks" in (out / "report.html").read_text()
     (bare / "landmarks.json").write_text((out / "landmarks.json").read_text())
     assert main(["run", str(bare), "--out", str(tmp_path / "next"), "--no-pictures"]) == 0
     noted = capsys.readouterr().err

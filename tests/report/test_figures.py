@@ -111,6 +111,21 @@ def test_an_estimate_beside_the_truth_stays_in_the_picture(run_record: RunRecord
         assert high - low < 4.0 * np.ptp(height) + 0.1
 
 
+def test_an_estimate_of_a_camera_at_rest_stays_in_the_picture(run_record: RunRecord) -> None:
+    """Where the truth spans nothing, the best estimate says how much is shown; a worse one does not shrink it."""
+    truth = run_record.references["imu"]
+    resting = replace(truth, T_world_body=truth.T_world_body[np.zeros(len(truth), dtype=int)])
+    estimates = []
+    for metres in (0.006, 2.0):
+        moved = RigidTransform.from_translation([0.0, 0.0, metres]) * resting.T_world_body
+        estimates.append(replace(run_record.estimates[-1], trajectory=replace(truth, T_world_body=moved)))
+    record = replace(run_record, references={"imu": resting}, estimates=tuple(estimates))
+    figure = trajectory_figure(record, "imu")
+    low, high = next(axes for axes in figure.axes if axes.get_ylabel() == "z [m]").get_ylim()
+    height = resting.T_world_body.translation[0, 2]
+    assert low < height < height + 0.006 < high < height + 0.1
+
+
 def test_lines_do_not_bridge_gaps() -> None:
     seconds = np.array([0.0, 0.1, 0.2, 0.9, 1.0])
     at, values = figure_style.broken(seconds, np.arange(5.0))

@@ -89,6 +89,8 @@ def test_tables_options_and_title_are_told(page, run_record):
 
 def test_without_ground_truth():
     assert "No ground truth" in report_page("run", [], [], "")
+    assert "Found beside" not in report_page("run", [], [], "")
+    assert "<li>gravity 1 deg &lt; 2</li>" in report_page("run", [], [], "", ["gravity 1 deg < 2"])
 
 
 def test_no_address_is_named(page):
