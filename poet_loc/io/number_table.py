@@ -188,6 +188,9 @@ def _explain(
             if what:
                 fix = _STAMPS if name.startswith("timestamp") and "." in cell else "correct or leave out the row"
                 raise InputError(f"column {name} {what}", path=path, line=line, fix=fix)
+    for line, text in enumerate(read_text(path).split("\n"), start=1):
+        if text and not text.strip():  # numpy passes over empty lines only
+            raise InputError("holds blanks only", path=path, line=line, fix="delete the line")
     raise InputError(f"cannot be read: {error}", path=path, fix="save it as plain text, one row a line") from error
 
 

@@ -56,6 +56,7 @@ def test_round_trip_is_exact(tmp_path_factory, stamps, seed):
         (HEADER + ROW + LATER.replace("1e-3", "nan"), 3, "w_RS_S_y is NaN"),
         (HEADER + ROW.replace("1403715273262142976", "1.403715273262142976e18"), 2, "timestamp holds '1.40371"),
         (HEADER + ROW + "1403715273267142977,1,2\n", 3, "3 values where 7 belong"),
+        (HEADER + ROW + "  \n" + LATER, 3, "blanks only"),
     ],
 )
 def test_bad_input(write, refusal, text, line, what):
