@@ -61,13 +61,21 @@ def check_rotations_against_map(log: Log) -> Iterator[Finding]:
     The rotation from one object to another is the same in the detections of a frame and in the map.
     """
     misfits = _misfits(log)
-    if not misfits or min(table["as is", "as is"] for table in misfits.values()) < _MISFITS_DEG:
-        return
-    name = min(misfits, key=lambda each: min(misfits[each].values()))
-    table = misfits[name]
+    wrong = [name for name, table in misfits.items() if table["as is", "as is"] >= _MISFITS_DEG]
+    if wrong and len(wrong) == len(misfits):  # the map may be what is written otherwise: the best set tells
+        best = min(misfits, key=lambda each: min(misfits[each].values()))
+        yield from _reading(log, best, misfits[best])
+    else:
+        for name in wrong:
+            as_mapped = {both: misfit for both, misfit in misfits[name].items() if both[1] == "as is"}
+            yield from _reading(log, name, as_mapped)
+
+
+def _reading(log: Log, name: str, table: dict[tuple[Reading, Reading], float]) -> Iterator[Finding]:
+    """Yield how a set of detections, or the map, is written, if one reading is clearly right."""
     order = sorted(table, key=lambda both: table[both] + 2.0 * sum(reading != "as is" for reading in both))
     if table[order[0]] >= _FITS_DEG or table[order[1]] <= table[order[0]] + _FITS_DEG:
-        return  # no other reading is clearly right
+        return
     of_detections, of_map = order[0]
     evidence: Evidence = {
         "median_misfit_deg": table["as is", "as is"],

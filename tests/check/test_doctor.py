@@ -202,3 +202,23 @@ def test_stamps_of_whole_seconds_end_in_findings_and_not_in_a_traceback(good_log
         rows = [f"{int(stamp) // 10**9},{rest}" for stamp, rest in cells]
         (tmp_path / name).write_text("\n".join([header, *rows]) + "\n")
     assert {"stamps-duplicate", "stamp-unit"} <= names(diagnose(tmp_path).findings)
+
+
+@pytest.mark.parametrize(("reading", "finding"), [("wxyz", "quaternion-order"), ("inverse", "poses-inverted")])
+def test_each_set_of_detections_is_looked_at(reading, finding, good_log, tmp_path) -> None:
+    """A set that fits the map says nothing of another one that is written otherwise."""
+    poses = good_log.object_poses[""]
+    T = poses.T_cam_obj
+    if reading == "wxyz":
+        q_wxyz = np.roll(T.rotation.as_quat(), 1, axis=1)
+        other = make_pose(Rotation.from_quat(q_wxyz), T.translation)
+    else:
+        other = T.inv()
+    sets = {"right": poses, "wrong": replace(poses, T_cam_obj=other)}
+    write_log(tmp_path, replace(good_log, object_poses=sets, imu=None))
+    diagnosis = diagnose(tmp_path)
+    found = [(each.check, each.file) for each in diagnosis.findings]
+    assert (finding, "object_poses_wrong.csv") in found
+    assert all(file == "object_poses_wrong.csv" for _, file in found)
+    write_repaired(diagnosis, tmp_path.parent / f"fixed_{reading}")
+    assert not diagnose(tmp_path.parent / f"fixed_{reading}").findings
