@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from poet_loc.core.input_error import InputError
+from poet_loc.core.records import LandmarkMap, ObjectPoses
 from poet_loc.io.frames_csv import read_frames
 from poet_loc.io.input_text import read_json
 from poet_loc.io.log_folder import Log, check_log, read_log_files, write_log
@@ -39,6 +40,8 @@ def convert_poet(results: str | Path, out: str | Path, options: ConvertPoetOptio
     object_ids = None if options.classes is None else _object_ids(options.classes)
     poses = stamp_poet_results(read_poet_results(results), frames, object_ids)
     like = Log(Path(out)) if options.like is None else read_log_files(options.like)
+    if like.landmark_map is not None:
+        _refuse_unmapped(poses, like.landmark_map, results, options)
     log = replace(
         like,
         path=Path(out),
@@ -50,6 +53,15 @@ def convert_poet(results: str | Path, out: str | Path, options: ConvertPoetOptio
     with whole_folder(out, options.overwrite, inputs) as folder:
         write_log(folder, log)
     return log
+
+
+def _refuse_unmapped(poses: ObjectPoses, mapped: LandmarkMap, results: str | Path, options: ConvertPoetOptions) -> None:
+    known = sorted(set(mapped.object_ids.tolist()))
+    unknown = sorted(set(poses.object_ids.tolist()) - set(known))
+    if unknown:
+        what = f"has objects {', '.join(map(str, unknown))}; the map of {options.like} has {', '.join(map(str, known))}"
+        fix = "add them to that map" if options.classes is not None else "give PoET's classes file with --classes"
+        raise InputError(what, path=results, fix=fix)
 
 
 def _object_ids(path: Path) -> Mapping[int, int]:

@@ -65,7 +65,7 @@ def test_poet_log_waits_for_its_map(results, tmp_path):
 @pytest.mark.parametrize(
     ("change", "what"),
     [
-        ({"classes": None}, "object 2 is not in the map"),
+        ({"classes": None}, r"results\.json: has objects 2; the map of .*like has 1, 5; give .* --classes"),
         ({"classes": "short.json"}, "class 2 has no object id"),
         ({"classes": "words.json"}, "is no classes file"),
         ({"stamps": "late.csv"}, "no common time span"),
