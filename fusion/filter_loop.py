@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 
+from fusion.ballot import WHOLE
 from fusion.bias_spread import follow_spreads
 from fusion.columns import OUT_CORE, OUT_SIGMA, Columns, Rows
 from fusion.compiled import njit
@@ -19,7 +20,6 @@ from fusion.memory import (
     CLONED,
     CLONED_AT,
     DELAY,
-    INITIALISING,
     LAST_STAMP,
     LAST_UPDATE,
     LEAST_DELAY,
@@ -31,6 +31,7 @@ from fusion.memory import (
     UNHELD_ROW,
     UNHELD_SINCE,
     UNSURE_AT,
+    VOTE_HEAD,
     Memory,
     Work,
     views,
@@ -41,8 +42,9 @@ from fusion.new_states import clone_pose
 from fusion.object_biases import decay_biases, is_fair
 from fusion.place_watch import RELEASE, return_to_map, tally, watch
 from fusion.refused_odometry import follow_refusals
-from fusion.starting import cast_vote, restart_if_lost, start_again, try_to_start
+from fusion.starting import cast_vote, start_again, starts
 from fusion.tape import note_clone, note_decay, note_row
+from fusion.votes import VOTE_OBJECT
 
 PENDING = -1  # beside the decisions of the gate
 RETIMED_BEYOND_NS = 1_000_000
@@ -157,10 +159,8 @@ def measure(m: Memory, w: Work, log: Columns, first: int, last: int) -> None:
             _take_poses(m, w, log, poses, last)
             _meet_objects(m, w, log, poses, last)
         account(m, w, log, poses, last)
-        if c[MODE] == INITIALISING:
-            try_to_start(m, w)
-        else:
-            restart_if_lost(m, w)
+        if starts(m, w):
+            take_agreed(m, w, log, poses, last)
     if first < poses and c[MODE] == TRACKING:
         _clone(m)
 
@@ -179,6 +179,23 @@ def _take_poses(m: Memory, w: Work, log: Columns, first: int, last: int) -> None
     for j in range(first, last if accepted else first):
         if log.decisions[j] == REJECTED:
             log.decisions[j] = take(m, w, log, j, True)
+
+
+@njit(cache=True)
+def take_agreed(m: Memory, w: Work, log: Columns, first: int, last: int) -> None:
+    """Take in those poses of a start's stamp that agreed to it: a gross error that came first would win the state.
+
+    Not while the time offset is unknown: with it, they agreed to a velocity that is not the camera's.
+    """
+    if m.layout[AT_TIME_OFFSET] >= 0:
+        return
+    slot, ring = m.counters[VOTE_HEAD] - 1, len(m.vote_stamps)
+    for j in range(last - 1, first - 1, -1):
+        at = slot & (ring - 1)
+        if m.vote_stamps[at] == m.counters[NOW] and m.votes[at, VOTE_OBJECT] == log.objects[j]:
+            slot -= 1
+            if m.inliers[at] & WHOLE and log.decisions[j] == REJECTED:
+                log.decisions[j] = take(m, w, log, j, True)
 
 
 @njit(cache=True)

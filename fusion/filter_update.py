@@ -24,7 +24,7 @@ from fusion.tape import note_correction, note_forgetting, note_meeting
 LIMIT_BOTH, LIMIT_ROTATION, LIMIT_POSITION, PARTIAL, ADAPTATION, MAX_SCALE, JUMP_AFTER, SETTLED = range(8)
 
 GROSS = 10.0  # times the limit of the rotation's nis
-LINEAR = 0.35  # rad: a turn beyond it is left to votes that agree with each other (`starting.restart_if_lost`)
+LINEAR = 0.35  # rad: a turn beyond it is left to votes that agree with each other (`starting.starts`)
 
 
 @njit(cache=True)

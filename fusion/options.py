@@ -236,7 +236,7 @@ class Prior:
     """Attitude, deg."""
     position: float = 0.08
     """Position, m."""
-    velocity: float = 0.3
+    velocity: float = 0.2
     """Velocity, m/s."""
     gyroscope_bias: float = 0.02
     """Gyroscope bias, rad/s."""

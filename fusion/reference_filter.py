@@ -11,7 +11,8 @@ import numpy as np
 from filterpy.kalman import predict, update
 from scipy.spatial.transform import Rotation
 
-from fusion import filter_loop, filter_motion, filter_update, imu, memory, odometry, starting
+from fusion import filter_loop, filter_motion, filter_update, imu, memory, odometry
+from fusion.ballot import WHOLE
 from fusion.bias_spread import follow_spreads
 from fusion.columns import OUT_CORE, OUT_SIGMA, Columns, Rows
 from fusion.eskf import ACCEPTED, POSITION_ONLY, REJECTED, ROTATION_ONLY
@@ -55,6 +56,8 @@ from fusion.reference_models import (
 from fusion.refused_odometry import follow_refusals
 from fusion.result import FuseResult
 from fusion.scatter import follow_scatter
+from fusion.starting import starts
+from fusion.votes import VOTE_OBJECT
 from poet_loc.core.geometry import make_pose
 
 
@@ -255,6 +258,16 @@ class ReferenceFilter:
             self.take(log, j, correcting=False)
         return sorted(order, key=lambda j: float(log.nis[j, 0]))
 
+    def _take_agreed(self, log: Columns, first: int, last: int) -> None:
+        """Take in those poses of a start's stamp that agreed to it."""
+        m, slot = self.m, int(self.m.counters[memory.VOTE_HEAD]) - 1
+        for j in reversed(range(first, last if not self.layout.time_offset else first)):
+            at = slot % len(m.vote_stamps)
+            if m.vote_stamps[at] == m.counters[memory.NOW] and m.votes[at, VOTE_OBJECT] == log.objects[j]:
+                slot -= 1
+                if m.inliers[at] & WHOLE and log.decisions[j] == REJECTED:
+                    log.decisions[j] = self.take(log, j)
+
     def measure(self, log: Columns, first: int, last: int) -> None:
         """Take in all measurements of one stamp, then see whether to start or to start again."""
         m, kinds, decisions, c = self.m, log.kinds, log.decisions, self.m.counters
@@ -285,10 +298,8 @@ class ReferenceFilter:
                     self._put_object(log, j)
                     decisions[j] = ACCEPTED
         filter_loop.account(m, self.work, log, first, last)
-        if self.tracking:
-            starting.restart_if_lost(m, self.work)
-        else:
-            starting.try_to_start(m, self.work)
+        if starts(m, self.work):
+            self._take_agreed(log, first, last)
         if odometry < first and self.tracking:
             self.clone()
 

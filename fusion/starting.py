@@ -29,6 +29,7 @@ from fusion.meeting import forget_rivals
 from fusion.memory import (
     BIAS_TIME,
     CLONED,
+    INITIALISING,
     LAST_UPDATE,
     MODE,
     NOW,
@@ -61,7 +62,7 @@ from fusion.nav_state import (
     VELOCITY,
     Array,
 )
-from fusion.object_biases import bias_sigma
+from fusion.object_biases import bias_sigma, is_fair
 from fusion.place_watch import ON_MAP, forget_places, status_of
 from fusion.so3_kernels import (
     apply,
@@ -101,7 +102,8 @@ def cast_vote(
         vote[12 + i] = m.x[i]
     for i in range(3):
         vote[21 + i] = m.x[POSITION + i]
-    m.used[slot] = decision & POSITION_ONLY  # rotation alone does not hold the position
+    # Neither rotation alone holds the position nor what was let in as a gross error of its object.
+    m.used[slot] = decision & POSITION_ONLY if kind != OBJECT_POSE or is_fair(m, k) else 0
     m.vote_stamps[slot] = m.counters[NOW]
     m.counters[VOTE_HEAD] += 1
 
@@ -229,7 +231,13 @@ def _is_contested(m: Memory, w: Work, first: int) -> bool:
 
 
 @njit(cache=True)
-def try_to_start(m: Memory, w: Work) -> None:
+def starts(m: Memory, w: Work) -> bool:
+    """Start, or start again, where the votes up to now call for it; tell whether it did."""
+    return _starts_first(m, w) if m.counters[MODE] == INITIALISING else _starts_again(m, w)
+
+
+@njit(cache=True)
+def _starts_first(m: Memory, w: Work) -> bool:
     """Start at the pose that is given, or where enough votes agree and no other pose has nearly as many.
 
     The pose that is given is where the log began, not where a filter that gave up is by now.
@@ -237,9 +245,10 @@ def try_to_start(m: Memory, w: Work) -> None:
     if m.start[IS_GIVEN] > 0.0 and m.counters[RESTARTS] == 0:
         _agree_with_given_pose(m, w)
     elif not _found_by_votes(m, w):
-        return
+        return False
     adopt(m, w, 0)
     m.counters[MODE], m.counters[STARTED_AT], m.counters[LAST_UPDATE] = TRACKING, m.counters[NOW], m.counters[NOW]
+    return True
 
 
 @njit(cache=True)
@@ -272,16 +281,16 @@ def _found_by_votes(m: Memory, w: Work) -> bool:
 
 
 @njit(cache=True)
-def restart_if_lost(m: Memory, w: Work) -> None:
+def _starts_again(m: Memory, w: Work) -> bool:
     """Start again where hardly anything of late was accepted and what was refused agrees with itself."""
     since_start = (m.counters[NOW] - m.counters[STARTED_AT]) * 1e-9
     window = min(m.start[LOST_WINDOW_S], max(m.start[START_WINDOW_S], since_start))  # a wrong start is mended soon
     first, head = first_vote(m, window, int(m.start[LOST_MIN_VOTES])), m.counters[VOTE_HEAD]
     if head - first < m.start[LOST_MIN_VOTES]:
-        return
+        return False
     used = used_since(m, first)
     if used > m.start[LOST_SHARE] * (head - first):
-        return
+        return False
     m.up[0], m.up[1], m.up[2] = 0.0, 0.0, 1.0
     count = _agreement(m, w, first, False)[0]
     if count < m.start[LOST_MIN_VOTES] and used == 0.0 and since_start >= m.start[LOST_WINDOW_S]:
@@ -289,9 +298,11 @@ def restart_if_lost(m: Memory, w: Work) -> None:
         m.up[2] = 0.0
         count = _agreement(m, w, first, False)[0]
         if 2 * count < head - first:
-            return
-    if count >= m.start[LOST_MIN_VOTES] and count > 3.0 * used and not _is_contested(m, w, first):
-        start_again(m, w, GYRO_BIAS_ERROR)
+            return False
+    if count < m.start[LOST_MIN_VOTES] or count <= 3.0 * used or _is_contested(m, w, first):
+        return False
+    start_again(m, w, GYRO_BIAS_ERROR)
+    return True
 
 
 @njit(cache=True)

@@ -105,11 +105,18 @@ def test_fed_one_by_one_and_late_it_is_the_same():
 
 @pytest.mark.parametrize("estimator", ["eskf", "graph"])
 def test_on_real_logs_nothing_runs_away(shared_data, estimator):
-    """Windows of real logs in which gross errors after the start sent the filter off by 50 and 60 m."""
-    for folder, motion, begin_s, seconds, each in (("0055", "auto", 20.83, 32.17, 1), ("0001", "imu", 2.47, 34.5, 10)):
+    """Windows of real logs in which gross errors after the start sent the filter off by 50, 60 and 8 m.
+
+    In the third what ran away let its object in as a gross error of its own, and so seemed to be held by it.
+    """
+    for folder, motion, object_id, begin_s, seconds, each, least in (
+        ("0055", "auto", 3, 20.83, 32.17, 1, 4.0),
+        ("0001", "imu", 3, 2.47, 34.5, 10, 6.0),
+        ("0050", "auto", 2, 44.96, 15.49, 1, 0.5),
+    ):
         log = read_log(shared_data / "ycbv_dope" / folder)
         poses = log.object_poses["synthetic"]
-        poses = poses[(poses.object_ids == 3) & (poses.frames % each == 0)]
+        poses = poses[(poses.object_ids == object_id) & (poses.frames % each == 0)]
         begin_ns = log.object_poses["synthetic"].stamps_ns[0] + int(begin_s * 1e9)
         end_ns = begin_ns + int(seconds * 1e9)
         imu = log.imu[(log.imu.stamps_ns >= begin_ns) & (log.imu.stamps_ns <= end_ns)]
@@ -117,4 +124,4 @@ def test_on_real_logs_nothing_runs_away(shared_data, estimator):
         poses = poses[(poses.stamps_ns >= begin_ns) & (poses.stamps_ns <= end_ns)]
         window = replace(log, imu=imu, T_odom_cam=odometry, object_poses={"": poses})
         _, position = errors(fuse(window, FuseOptions(estimator=estimator, motion=motion)), window)
-        assert np.sqrt(np.mean(position**2)) < 4.0
+        assert np.sqrt(np.mean(position**2)) < least

@@ -57,12 +57,20 @@ class FixedPoint(reference_filter.ReferenceFilter):
                 self.C[:, self.layout.error_slice("biases", log.objects[j], kind)] = 0.0
         super()._put_object(log, j)
 
-    def measure(self, *arguments):
-        super().measure(*arguments)
+    def forget_what_starts_anew(self):
         if hasattr(self, "C"):  # what has been started anew knows nothing of the kept state
             anew = np.array([np.count_nonzero(row) == 1 for row in self.m.P])
             self.C[:, anew] = 0.0
             self.started_anew += np.count_nonzero(anew)
+
+    def _take_agreed(self, *arguments):
+        self.forget_what_starts_anew()
+        super()._take_agreed(*arguments)
+
+    def measure(self, *arguments):
+        super().measure(*arguments)
+        if hasattr(self, "C"):
+            self.forget_what_starts_anew()
         elif self.m.counters[memory.NOW] >= self.anchor:
             self.keep()
 

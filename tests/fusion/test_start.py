@@ -220,6 +220,24 @@ def test_flips_soon_after_the_start_do_not_move_the_filter():
     assert used[4:12].all()
 
 
+def test_a_gross_error_right_after_the_start_does_not_win_the_state():
+    """The poses of the start's own stamp are taken in, so that the gate is theirs when the next one comes."""
+    log = table([None], camera_rate_hz=30.0)
+    began = int(fuse(log, OPTIONS).stamps_ns[0])
+    poses = log.object_poses[""]
+    next_one = np.searchsorted(poses.stamps_ns, began, side="right")
+    shown = poses.T_cam_obj.translation
+    shown[next_one] *= 1.0 + 0.3 / np.linalg.norm(shown[next_one])
+    log = replace(log, object_poses={"": replace(poses, T_cam_obj=make_pose(poses.T_cam_obj.rotation, shown))})
+    result = fuse(log, OPTIONS)
+    used = result.gate.position_accepted
+    assert result.stamps_ns[0] == began
+    assert result.gate.stamps_ns[next_one - 1] == began
+    assert used[next_one - 1]
+    assert not used[next_one]
+    assert used[next_one + 1 : next_one + 11].all()
+
+
 @pytest.mark.parametrize("given", [False, True])
 @pytest.mark.parametrize("log", [table([CAN, CAN, BOX]), turned(table([None] * 4), 25.0)])
 def test_compiled_is_plain_and_shuffled_is_in_order(log, given):
