@@ -82,6 +82,8 @@ def open_bag(path: str | Path, typestore: str | None = None) -> Iterator[Any]:
         fix = "give a .bag, .db3, .mcap or the folder of a ROS 2 bag"
         if "no type definitions" in str(error):
             fix = "name the ROS that wrote it: --typestore ros2_foxy, ros2_humble, .."
+        elif "end magic" in str(error):
+            fix = "a recording that was cut off is mended by: mcap recover FILE"
         raise InputError(f"cannot be opened: {error}", path=path, fix=fix) from error
     try:
         yield reader

@@ -269,6 +269,12 @@ def _log_of(
             raise InputError(f"topic {chosen[role]} has no message that can be used", fix="look at its frames' names")
         numbers = np.array(read.numbers).reshape(len(stamps), -1)
         keep = _kept(role, stamps, numbers)
+        if not stamps.any():
+            raise InputError(f"the headers of {chosen[role]} have no stamps", fix="let the driver stamp its messages")
+        if not len(keep):
+            raise InputError(
+                f"the quaternions of {chosen[role]} are zero", fix=f"choose another topic than {chosen[role]}"
+            )
         if len(keep) < len(stamps):
             dropped[chosen[role]] = len(stamps) - len(keep)
         stamps, numbers = stamps[keep], numbers[keep]

@@ -234,6 +234,34 @@ def test_what_is_wrong_with_topics_is_one_line(tmp_path) -> None:
     assert not (tmp_path / "log").exists()
 
 
+@pytest.mark.parametrize(
+    ("topic", "words"), [("/imu", "headers of /imu have no stamps"), ("/objects", "quaternions of /objects are zero")]
+)
+def test_messages_that_a_driver_left_unfilled_are_told(topic, words, tmp_path, like, monkeypatch) -> None:
+    if topic == "/imu":
+        header = Messages.header
+        monkeypatch.setattr(
+            Messages, "header", lambda self, stamp, frame: header(self, stamp * (frame != "imu"), frame)
+        )
+    else:
+        zero = lambda self, row: self.types["geometry_msgs/msg/Pose"](  # noqa: E731
+            self.xyz("Point", POSES.translation[row]), self.types["geometry_msgs/msg/Quaternion"](0.0, 0.0, 0.0, 0.0)
+        )
+        monkeypatch.setattr(Messages, "pose", zero)
+    bag = write_bag(tmp_path / "bag", "db3", "ros2_humble")
+    with pytest.raises(InputError, match=words):
+        convert_rosbag(bag, tmp_path / "log", ConvertRosbagOptions(like=like, camera_poses="none"))
+    assert not (tmp_path / "log").exists()
+
+
+def test_a_recording_that_was_cut_off_names_its_cure(tmp_path) -> None:
+    folder = write_bag(tmp_path / "bag", "mcap", "ros2_humble")
+    file = next(folder.glob("*.mcap"))
+    file.write_bytes(file.read_bytes()[:-200])
+    with pytest.raises(InputError, match="mcap recover"):
+        list_topics(file)
+
+
 def whole_log() -> Log:
     ids = np.array([3, 4, 3, 4, 3, 4])
     stamps = np.repeat(STAMPS[:3], 2)
