@@ -412,7 +412,10 @@ def empty_problem(
     if calibration.imu is None or calibration.T_cam_imu is None:
         raise InputError("fusion needs T_cam_imu and the IMU's noise densities", fix="add them to the calibration")
     if options.measurements == "objects" and landmark_map is None:
-        raise InputError("object poses need a map", fix="give landmark_map, or fuse camera poses")
+        fix = (
+            "give landmark_map (of a recorded log, poet-loc fuse --estimate.map unknown finds it), or fuse camera poses"
+        )
+        raise InputError("object poses need a map", fix=fix)
     layout = layout or layout_for(landmark_map, options)
     nothing, none = np.empty(0), np.empty(0, dtype=np.int64)
     return Problem(

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from typing import Literal
 
 from fusion.option_ranges import refuse_impossible
-from poet_loc.core.input_error import InputError
+from poet_loc.core.input_error import InputError, refuse_other_words
 
 
 @dataclass(frozen=True)
@@ -393,4 +393,5 @@ class FuseOptions:
     graph: Graph = field(default_factory=Graph)
 
     def __post_init__(self) -> None:
+        refuse_other_words(self)
         refuse_impossible(self)

@@ -8,7 +8,7 @@ from typing import Any, Literal
 
 from fusion.detection_errors import NetworkErrors, WhiteErrors
 from poet_loc.core import unread_options
-from poet_loc.core.input_error import InputError, within
+from poet_loc.core.input_error import InputError, refuse_other_words, within
 from poet_loc.core.records import ImuNoise
 from poet_loc.core.unread_options import Rule
 
@@ -91,6 +91,7 @@ class SimulationOptions:
     """Random walk of the odometry's rotation, deg/sqrt(s)."""
 
     def __post_init__(self) -> None:
+        refuse_other_words(self)
         within("[0.5, inf)", self, "duration_s")
         within("(0, inf)", self, "imu_rate_hz", "camera_rate_hz")
         within("[1, inf)", self, "objects")

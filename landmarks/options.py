@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Literal
 
-from poet_loc.core.input_error import InputError, within
+from poet_loc.core.input_error import InputError, refuse_other_words, within
 
 Mode = Literal["all", "out", "prev", "best", "robust"]
 """all: every vote is averaged; out: the largest set of votes that agree; prev: the same, ties by the previous frame;
@@ -83,6 +83,7 @@ class SolverOptions:
     """robust: what is kept of the past."""
 
     def __post_init__(self) -> None:
+        refuse_other_words(self)
         within("(0, 1)", self, "gate_probability")
         within("[0, 1]", self, "memory.white_share")
         within("(0, inf)", self, "noise.rotation_deg")

@@ -51,9 +51,10 @@ class PoetLocNode(Node):
 
     def on_detections(self, message: Detection3DArray) -> None:
         """Feed the object poses of one frame; late frames are put in their place by the estimator."""
-        if not message.detections:
+        named = [each.results for each in message.detections if each.results]
+        if not named:
             return
-        best = [max(each.results, key=lambda result: result.hypothesis.score) for each in message.detections]
+        best = [max(results, key=lambda result: result.hypothesis.score) for results in named]
         poses = [result.pose.pose for result in best]
         self.estimator.feed_object_poses(
             nanoseconds(message.header.stamp),

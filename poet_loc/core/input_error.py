@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import math
+from dataclasses import is_dataclass
+from functools import lru_cache
 from operator import attrgetter
 from pathlib import Path
+from typing import Any, Literal, get_args, get_origin, get_type_hints
 
 
 class InputError(Exception):
@@ -56,3 +59,23 @@ def within(interval: str, options: object, *names: str) -> None:
         if not inside or (open_low and value == low) or (open_high and value == high):
             fix = f"give {least}" if math.isinf(high) and value != high else f"give {least} and {most}"
             raise InputError(f"{name.replace('_', '-')} is {value!r}", fix=fix)
+
+
+def refuse_other_words(options: Any, place: str = "") -> None:
+    """Raise InputError for a word that a field of an options record, or of a record in it, does not know.
+
+    The command line sees to that by itself; a program does not. A field that is no record of its type is refused, too.
+    """
+    for name, kind in _kinds(type(options)).items():  # type: ignore[arg-type]
+        value, called = getattr(options, name), f"{place}{name}"
+        if get_origin(kind) is Literal and value not in get_args(kind):
+            raise InputError(f"{called} is {value!r}", fix=f"choose among {', '.join(map(str, get_args(kind)))}")
+        if is_dataclass(kind):
+            if not isinstance(value, kind):  # type: ignore[arg-type]
+                raise InputError(f"{called} is {value!r}", fix=f"give {kind.__name__}(..)")  # type: ignore[union-attr]
+            refuse_other_words(value, f"{called}.")
+
+
+@lru_cache
+def _kinds(record: type) -> dict[str, Any]:
+    return get_type_hints(record)

@@ -190,7 +190,7 @@ def test_mistakes_and_empty_input() -> None:
     landmarks, truth, poses = messy_world(9, 5, 3)
     with pytest.raises(InputError, match="oracle and needs the ground truth"):
         solve(poses, landmarks, SolverOptions(mode="best"))
-    with pytest.raises(InputError, match="unknown mode 'median'; choose among all, out"):
+    with pytest.raises(InputError, match="mode is 'median'; choose among all, out"):
         solve(poses, landmarks, SolverOptions(mode="median"))  # type: ignore[arg-type]
     for mode in MODES:
         for nothing, world in ((poses[:0], landmarks), (poses, LandmarkMap())):
