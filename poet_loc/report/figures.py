@@ -236,7 +236,7 @@ def landmark_figure(record: RunRecord, decisions: Decisions, name: str) -> Figur
         panel.plot(
             [], [], color=_DECISION_COLOURS[decision], linewidth=5, label=f"{DECISIONS[decision]} ({share:.1f} %)"
         )
-    panel.set_yticks(range(len(lanes)), [record.landmark_label(*key) for key in lanes])
+    panel.set_yticks(range(len(lanes)), [_landmark_text(record, *key) for key in lanes])
     panel.set_ylim(len(lanes) - 0.5, -0.5)
     panel.grid(axis="y", visible=False)
     panel.set_xlabel(_TIME)
@@ -245,6 +245,7 @@ def landmark_figure(record: RunRecord, decisions: Decisions, name: str) -> Figur
     return figure
 
 
+_LONGEST_NAME = 28
 _BODY_NAMES = {"cam": "camera", "imu": "IMU"}
 
 
@@ -331,8 +332,18 @@ def _draw_landmarks(panel: Axes, record: RunRecord) -> None:
     for landmark in record.landmark_map or ():
         x, y = landmark.T_world_obj.translation[:2]
         panel.plot(x, y, "D", color=TRUTH, markerfacecolor="white", markersize=4, zorder=25)
-        text = record.landmark_label(*landmark.key)
-        panel.annotate(text, (x, y), xytext=(4, 3), textcoords="offset points", fontsize=6, color=TRUTH, zorder=26)
+        text = _landmark_text(record, *landmark.key)
+        mark = panel.annotate(
+            text, (x, y), xytext=(4, 3), textcoords="offset points", fontsize=6, color=TRUTH, zorder=26
+        )
+        mark.set_in_layout(False)  # else a name that reaches over the edge shrinks the panels
+
+
+def _landmark_text(record: RunRecord, object_id: int, instance: int) -> str:
+    """Return a landmark's name, shortened, and no part of it taken for a formula."""
+    text = record.landmark_label(object_id, instance)
+    shown = text if len(text) <= _LONGEST_NAME else f"{text[: _LONGEST_NAME - 9]}…{text[-8:]}"
+    return shown.replace("$", r"\$")
 
 
 def _draw_bounds(panel: Axes, degrees_of_freedom: int) -> None:

@@ -19,7 +19,14 @@ from poet_loc.core.input_error import InputError
 from poet_loc.report import figure_style
 from poet_loc.report import figures as figures_module
 from poet_loc.report.evaluate import ERROR_AXES
-from poet_loc.report.figures import draw_run, error_figure, top_view_figure, trajectory_figure, write_figures
+from poet_loc.report.figures import (
+    draw_run,
+    error_figure,
+    landmark_figure,
+    top_view_figure,
+    trajectory_figure,
+    write_figures,
+)
 from poet_loc.report.run_record import ACCEPTED, POSITION_ONLY, REFUSED, ROTATION_ONLY, RunRecord
 
 EXPECTED = {
@@ -124,6 +131,28 @@ def test_an_estimate_of_a_camera_at_rest_stays_in_the_picture(run_record: RunRec
     low, high = next(axes for axes in figure.axes if axes.get_ylabel() == "z [m]").get_ylim()
     height = resting.T_world_body.translation[0, 2]
     assert low < height < height + 0.006 < high < height + 0.1
+
+
+def test_names_as_of_a_database_leave_the_panels_their_size(run_record: RunRecord) -> None:
+    """Long, with what would be a broken formula; panels are as wide as with short names."""
+
+    def named(name: str) -> RunRecord:
+        landmarks = [replace(each, name=name) for each in run_record.landmark_map]
+        return replace(run_record, landmark_map=replace(run_record.landmark_map, landmarks=tuple(landmarks)))
+
+    long = named("CAD_0001_" + 6 * "of_a_very_long_name_" + "$\\frac$_rev_B")
+    widths = []
+    for record in (named("box"), long):
+        figure = top_view_figure(record)
+        figure.draw_without_rendering()
+        widths.append([axes.get_window_extent().width for axes in figure.axes])
+    assert widths[1] == pytest.approx(widths[0], rel=0.02)
+    name, decisions = next(iter(long.decisions.items()))
+    figure = landmark_figure(long, decisions, name)
+    figure.draw_without_rendering()
+    assert figure.axes[0].get_window_extent().width > 0.5 * figure.bbox.width
+    texts = [text.get_text() for text in figure.axes[0].get_yticklabels()]
+    assert all(text.startswith("CAD_0001_") and "_B" in text and len(text) < 32 for text in texts)
 
 
 def test_lines_do_not_bridge_gaps() -> None:
