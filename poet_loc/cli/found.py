@@ -53,7 +53,7 @@ def _map(found: LandmarkMap, given: LandmarkMap | None) -> str:
     R = np.array([landmark.covariance for landmark in found])
     turn, place = np.sqrt(np.einsum("nii->ni", R).reshape(-1, 2, 3).mean(axis=2)).T
     free = place > _ANCHOR_M
-    line = f"{len(found)} landmarks" if given is None else f"{len(found)} of {len(given)} landmarks"
+    line = f"{len(found)} of {len(given or found)} landmarks"
     if free.any():
         line += f", 1-sigma {_range(1e3 * place[free], 1)} mm and {_range(np.degrees(turn[free]), 2)} deg per axis"
     if len(free) - free.sum() == 1:

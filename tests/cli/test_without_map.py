@@ -35,11 +35,11 @@ def test_fuse_makes_the_map_and_says_that_ground_truth_is_of_another_world(bare,
     assert "no ground truth" not in said.err
     made = read_landmarks(out / "landmarks.json")
     assert [each.object_id for each in made] == [1, 2, 3, 4]
-    assert "found 4 landmarks, 1-sigma" in said.out
+    assert "found 4 of 4 landmarks, 1-sigma" in said.out
     assert "anchors the world" in said.out
     assert "gravity_m_s2" in json.loads((out / "calibrated.json").read_text())
     assert not (out / "errors.csv").exists()
-    assert "<li>fuse/eskf/objects found 4 landmarks" in (out / "report.html").read_text()
+    assert "<li>fuse/eskf/objects found 4 of 4 landmarks" in (out / "report.html").read_text()
     (bare / "landmarks.json").write_text((out / "landmarks.json").read_text())
     assert main(["run", str(bare), "--out", str(tmp_path / "next"), "--no-pictures"]) == 0
     noted = capsys.readouterr().err
