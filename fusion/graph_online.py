@@ -60,6 +60,8 @@ class GraphEstimator(Estimator):
     what the filter needs.
     """
 
+    _estimator = "graph"
+
     def __init__(
         self,
         calibration: Calibration,
@@ -68,7 +70,9 @@ class GraphEstimator(Estimator):
         online: OnlineOptions | None = None,
         layout: StateLayout | None = None,
     ) -> None:
-        options = replace(options or FuseOptions(), estimator="graph")
+        options = options or FuseOptions()
+        if options.estimator == "eskf":  # the default
+            options = replace(options, estimator="graph")
         super().__init__(calibration, landmark_map, options, online, layout)
 
     def _begin(self) -> None:

@@ -153,6 +153,8 @@ class Estimator:
     The first call compiles or loads the kernels: construct it, which does that, before the loop runs.
     """
 
+    _estimator = "eskf"
+
     def __init__(
         self,
         calibration: Calibration,
@@ -162,6 +164,9 @@ class Estimator:
         layout: StateLayout | None = None,
     ) -> None:
         self.options, self.online = options or FuseOptions(), online or OnlineOptions()
+        if self.options.estimator != self._estimator or self.options.smooth:
+            what = f"{type(self).__name__} is no {'smoother' if self.options.smooth else self.options.estimator}"
+            raise InputError(what, fix="Estimator is the filter (eskf), GraphEstimator the fixed-lag graph (graph)")
         problem = empty_problem(calibration, landmark_map, self.options, layout)
         self.layout, self.keys = problem.layout, problem.keys
         self._floats, self._integers = fill_memory(problem, self.options)

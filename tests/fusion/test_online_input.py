@@ -152,3 +152,14 @@ def test_what_was_found_beside_the_trajectory_can_be_asked_for(kind):
     found = estimator.calibrated()
     assert abs(found.timeshift_cam_imu_s + 0.02) < 4.0 * found.timeshift_sigma_s < 0.015
     assert [landmark.key for landmark in found.landmark_map] == [landmark.key for landmark in log.landmark_map]
+
+
+def test_an_estimator_that_is_not_there_online_is_not_replaced_by_another(log):
+    for kind, options in (
+        (Estimator, FuseOptions(estimator="graph")),
+        (Estimator, FuseOptions(smooth=True)),
+        (GraphEstimator, FuseOptions(estimator="batch")),
+    ):
+        with pytest.raises(InputError, match="GraphEstimator"):
+            new(kind, log, options)
+    assert new(GraphEstimator, log, FuseOptions(estimator="graph")).options.estimator == "graph"
