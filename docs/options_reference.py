@@ -14,7 +14,7 @@ from typing import Any, get_type_hints
 STAGES = (
     ("localize", "landmarks.localize", "LocalizeOptions"),
     ("fuse", "fusion.options", "FuseOptions"),
-    ("the online estimator", "fusion.online", "OnlineOptions"),
+    ("the online estimator", "fusion.online_input", "OnlineOptions"),
     ("evaluate: rows of a run", "poet_loc.report.evaluate", "EvaluateOptions"),
     ("evaluate: one trajectory against another", "poet_loc.report.compare", "CompareOptions"),
     ("fit-noise", "fusion.fit_noise", "FitNoiseOptions"),

@@ -31,7 +31,8 @@ from fusion.graph_walk import HERE, IMU_ROW, NEXT, ROWS, Walk
 from fusion.imu_noise import REACH, follow_noise
 from fusion.measurements import Measurements
 from fusion.nav_state import StateLayout
-from fusion.online import Estimator, Health, OnlineOptions
+from fusion.online import Estimator, Health
+from fusion.online_input import OnlineOptions
 from fusion.options import FuseOptions
 from fusion.prepare import Problem
 from poet_loc.core.records import Calibration, ImuSamples, LandmarkMap
@@ -74,6 +75,9 @@ class GraphEstimator(Estimator):
         if options.estimator == "eskf":  # the default
             options = replace(options, estimator="graph")
         super().__init__(calibration, landmark_map, options, online, layout)
+
+    def __getstate__(self) -> dict[str, Any]:
+        raise TypeError("a GraphEstimator cannot be copied; construct another and feed it the same")
 
     def _begin(self) -> None:
         self._lag_ns = round(self.options.graph.lag_s * 1e9)

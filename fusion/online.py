@@ -16,7 +16,7 @@ import math
 import operator
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import SupportsIndex
+from typing import Any, SupportsIndex
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -37,7 +37,7 @@ from fusion.measurements import (
 )
 from fusion.motion_source import odometry_spread, scaled_noise
 from fusion.nav_state import ACCEL_BIAS, CORE, GYRO_BIAS, POSITION, VELOCITY, StateLayout
-from fusion.online_input import ImuClock, shaped, vector
+from fusion.online_input import ImuClock, OnlineOptions, shaped, vector
 from fusion.options import FuseOptions
 from fusion.place_watch import (
     IN_A_ROW,
@@ -52,35 +52,12 @@ from fusion.place_watch import (
 )
 from fusion.prepare import NEAREST_OBJECT, Problem, fill_memory, layout_for, time_shift_ns
 from poet_loc.core.geometry import make_pose
-from poet_loc.core.input_error import InputError, within
+from poet_loc.core.input_error import InputError
 from poet_loc.core.records import Calibration, ImuSamples, LandmarkMap
 from poet_loc.io.pose_columns import not_positive_definite
 
 Array = NDArray[np.float64]
 _NO_OBJECT = np.array([-1])
-
-
-@dataclass(frozen=True)
-class OnlineOptions:
-    """How late and how dense the input of an online estimator may be."""
-
-    horizon_s: float = 0.5
-    """What is older than the newest IMU sample by more is refused and counted, s."""
-    ahead_s: float = 2.0
-    """Poses may run ahead of the IMU by so much and wait for it, s."""
-    snapshot_s: float = 0.02
-    """The state is kept so often, s; something late costs the integration since the snapshot before it."""
-    max_imu_rate_hz: float = 1000.0
-    """The buffers hold the horizon at this rate of the IMU, Hz; above it the horizon shrinks."""
-    max_pose_rate_hz: float = 1000.0
-    """The buffers hold so many poses per second, over all objects, Hz; what does not fit is refused and counted."""
-    clock_set_s: float = 0.5
-    """Where all samples of the IMU were too late for so long, s, its clock was set back: what was fed is forgotten."""
-
-    def __post_init__(self) -> None:
-        within("(0, inf)", self, "snapshot_s", "max_imu_rate_hz", "max_pose_rate_hz")
-        within("[0, inf)", self, "horizon_s", "ahead_s")
-        within("(0, inf]", self, "clock_set_s")
 
 
 @dataclass(frozen=True)
@@ -201,11 +178,20 @@ class Estimator:
             round(o.ahead_s * 1e9),
             max(1, round(o.snapshot_s * 1e9)),
         )
-        self._ring = replay_memory.ring_views.py_func(self._ring_floats, self._ring_integers)
-        self._rate, self._force = self._ring.sample[:3], self._ring.sample[3:]
+        self._look_into_ring()
         self._not_in_map = 0
         self._odometry: tuple[int, Array, Array] | None = None
         self._feed(replay.POSES, 0, 0)
+
+    def _look_into_ring(self) -> None:
+        self._ring = replay_memory.ring_views.py_func(self._ring_floats, self._ring_integers)
+        self._rate, self._force = self._ring.sample[:3], self._ring.sample[3:]
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        """Look into the arrays of a copy: copied one by one, the views would show others."""
+        self.__dict__.update(state)
+        self.memory = memory.views.py_func(self._floats, self._integers)
+        self._look_into_ring()
 
     def feed_imu(self, stamp_ns: SupportsIndex, angular_velocity: ArrayLike, specific_force: ArrayLike) -> None:
         """Take in one IMU sample: (3,) rad/s and (3,) m/s^2 in imu axes.

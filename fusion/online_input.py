@@ -1,14 +1,39 @@
-"""What is looked at before an online estimator takes it in: the shapes of arrays, the clock of the IMU."""
+"""What an online estimator may be fed: how late and how dense, in which shapes, on which clock."""
 
 from __future__ import annotations
+
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from poet_loc.core.input_error import InputError
+from poet_loc.core.input_error import InputError, within
 from poet_loc.core.stamp_unit import FASTEST_IMU_HZ
 
 _FIRST = 100  # samples that tell the unit of the stamps
+
+
+@dataclass(frozen=True)
+class OnlineOptions:
+    """How late and how dense the input of an online estimator may be."""
+
+    horizon_s: float = 0.5
+    """What is older than the newest IMU sample by more is refused and counted, s."""
+    ahead_s: float = 2.0
+    """Poses may run ahead of the IMU by so much and wait for it, s."""
+    snapshot_s: float = 0.02
+    """The state is kept so often, s; something late costs the integration since the snapshot before it."""
+    max_imu_rate_hz: float = 1000.0
+    """The buffers hold the horizon at this rate of the IMU, Hz; above it the horizon shrinks."""
+    max_pose_rate_hz: float = 1000.0
+    """The buffers hold so many poses per second, over all objects, Hz; what does not fit is refused and counted."""
+    clock_set_s: float = 0.5
+    """Where all samples of the IMU were too late for so long, s, its clock was set back: what was fed is forgotten."""
+
+    def __post_init__(self) -> None:
+        within("(0, inf)", self, "snapshot_s", "max_imu_rate_hz", "max_pose_rate_hz")
+        within("[0, inf)", self, "horizon_s", "ahead_s")
+        within("(0, inf]", self, "clock_set_s")
 
 
 def shaped(name: str, values: ArrayLike, *shape: int) -> NDArray[np.float64]:

@@ -10,7 +10,8 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from fusion.graph_online import GraphEstimator
-    from fusion.online import Estimator, OnlineOptions, OnlineState
+    from fusion.online import Estimator, OnlineState
+    from fusion.online_input import OnlineOptions
     from fusion.options import FuseOptions
     from landmarks.localize import LocalizeOptions
     from poet_loc.api import Comparison, FusedTrajectory, Localization, evaluate, fuse, localize
@@ -56,7 +57,8 @@ _HOMES = {
     "poet_loc.io.log_folder": ("Log", "read_log"),
     "poet_loc.report.evaluate": ("EvaluateOptions",),
     "fusion.graph_online": ("GraphEstimator",),
-    "fusion.online": ("Estimator", "OnlineOptions", "OnlineState"),
+    "fusion.online": ("Estimator", "OnlineState"),
+    "fusion.online_input": ("OnlineOptions",),
     "fusion.options": ("FuseOptions",),
     "landmarks.localize": ("LocalizeOptions",),
 }

@@ -13,7 +13,7 @@ from test_online import stated_for
 from fusion.graph import run_graph
 from fusion.graph_online import GraphEstimator
 from fusion.measurements import Measurements
-from fusion.online import OnlineOptions
+from fusion.online_input import OnlineOptions
 from fusion.options import DetectionBias, Estimate, FuseOptions, Graph
 from fusion.prepare import time_shift_ns
 

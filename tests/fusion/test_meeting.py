@@ -12,7 +12,7 @@ from test_online import assert_ends_like, estimator_for, feed, shuffled
 
 from fusion import filter_loop, memory, reference_filter
 from fusion.fuse import fuse
-from fusion.online import OnlineOptions
+from fusion.online_input import OnlineOptions
 from fusion.options import DetectionBias, Estimate, FuseOptions, Meeting
 from fusion.prepare import Problem, pose_problem
 from fusion.simulate import SimulationOptions, simulate

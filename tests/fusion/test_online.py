@@ -13,7 +13,8 @@ from scipy.spatial.transform import Rotation
 from fusion import filter_loop, memory
 from fusion.bias_spread import white_part
 from fusion.measurements import CAMERA_POSE, ODOMETRY_STEP, Measurements
-from fusion.online import Estimator, OnlineOptions
+from fusion.online import Estimator
+from fusion.online_input import OnlineOptions
 from fusion.options import DetectionBias, FuseOptions, Odometry
 from fusion.prepare import Problem, pose_problem
 from fusion.simulate import SimulationOptions, simulate

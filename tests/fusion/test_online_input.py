@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+import copy
+import pickle
+
 import numpy as np
 import pytest
 from filter_runs import simulated
 from test_online import estimator_for, events, feed
 
 from fusion.graph_online import GraphEstimator
-from fusion.online import Estimator, OnlineOptions
+from fusion.online import Estimator
+from fusion.online_input import OnlineOptions
 from fusion.options import Estimate, FuseOptions
 from fusion.simulate import SimulationOptions, simulate
 from poet_loc.core.input_error import InputError
@@ -163,3 +167,22 @@ def test_an_estimator_that_is_not_there_online_is_not_replaced_by_another(log):
         with pytest.raises(InputError, match="GraphEstimator"):
             new(kind, log, options)
     assert new(GraphEstimator, log, FuseOptions(estimator="graph")).options.estimator == "graph"
+
+
+@pytest.mark.parametrize("again", [copy.deepcopy, lambda estimator: pickle.loads(pickle.dumps(estimator))])
+def test_a_copy_of_a_filter_goes_on_by_itself(again, log):
+    estimator = new(Estimator, log)
+    replay(estimator, log, until_s=3.0)
+    before = estimator.state()
+    other = again(estimator)
+    assert other.state().stamp_ns == before.stamp_ns
+    replay(other, log)
+    assert other.state().stamp_ns == log.imu.stamps_ns[-1]
+    np.testing.assert_array_equal(estimator.state().position, before.position)
+    replay(estimator, log)
+    np.testing.assert_array_equal(estimator.state().position, other.state().position)
+
+
+def test_a_copy_of_a_graph_is_refused(log):
+    with pytest.raises(TypeError, match="cannot be copied"):
+        copy.deepcopy(new(GraphEstimator, log))
