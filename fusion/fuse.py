@@ -129,7 +129,9 @@ def never_started(problem: Problem, options: FuseOptions) -> InputError:
         f"the filter never started: no {begin.min_votes} poses within {begin.window_s} s agree with each other"
         + {"odometry": " and with the odometry", "constant-velocity": ""}.get(problem.motion, " and with gravity"),
         path=problem.path,
-        fix="see what poet-loc check says of the log, relax --start, or give --start.pose",
+        fix="see what poet-loc check says of the log, relax --start, or give --start.pose"
+        if options.estimate.map != "unknown"
+        else "of an unknown map the anchor's rotation counts: where it is not known, leave landmarks.json out",
     )
 
 

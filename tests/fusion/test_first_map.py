@@ -12,6 +12,8 @@ from fusion.first_map import first_map
 from fusion.fuse import fuse
 from fusion.options import Estimate, FuseOptions
 from fusion.simulate import SimulationOptions, simulate
+from poet_loc.core.geometry import make_pose
+from poet_loc.core.input_error import InputError
 
 UNKNOWN = FuseOptions(estimate=Estimate(map="unknown"))
 
@@ -74,3 +76,11 @@ def test_a_camera_alone_needs_no_upright_world(bare, log):
     assert result.motion == "odometry"
     assert result.calibrated.gravity is None
     assert shape_error_m(result, log) < 0.04
+
+
+def test_a_map_whose_rotations_mean_nothing_is_told_to_be_left_out(bare, log):
+    """As one writes it who has no map: the anchor lies on its side."""
+    lying = make_pose(Rotation.from_euler("x", 90.0, degrees=True), np.zeros(3))
+    zeros = [replace(each, T_world_obj=lying * each.T_world_obj) for each in log.landmark_map]
+    with pytest.raises(InputError, match=r"never started.*leave landmarks\.json out"):
+        fuse(replace(bare, landmark_map=replace(log.landmark_map, landmarks=tuple(zeros))), UNKNOWN)
