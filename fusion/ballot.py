@@ -27,9 +27,11 @@ from fusion.nav_state import Array, Ints
     MIN_PLACES,
     LEAD,
     LOST_SIGMA,
+    FEW_VOTES,
+    FEW_SPAN_S,
     IS_GIVEN,
     GIVEN_POSE,
-) = range(19)
+) = range(21)
 GIVEN_POSE_SIZE = 12  # rotation, position
 
 AT_ITS_PLACE, WHOLE = 1, 2  # what of a vote agrees with a correction

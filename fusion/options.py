@@ -186,7 +186,11 @@ class Start:
     """Where the IMU (without one, the camera) is in the world at the first detection: x y z, m, and the quaternion
     qx qy qz qw. The filter then starts there, standing still, with the spread of --prior. None: from votes."""
     min_votes: int = 7
-    """Votes that must agree before anything is published."""
+    """Votes that must agree before anything is published,"""
+    few_votes: int = 4
+    """or so many where they span"""
+    few_span_s: float = 1.5
+    """this time, s: votes of a slow sensor are fewer and worth more, as a network's errors last."""
     min_share: float = 0.3
     """Share of the window's votes that must agree."""
     min_objects: int = 3

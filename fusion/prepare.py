@@ -226,7 +226,7 @@ def fill_memory(problem: Problem, options: FuseOptions) -> tuple[Array, NDArray[
     m.x[:] = nominal_state(layout, T_imu_cam=T_imu_cam, T_world_obj=T_world_obj, gravity=gravity)
     m.noise[:] = motion_noise(problem, options)
     m.limits[: filter_update.SETTLED + 1] = _limits(options)
-    m.start[: ballot.LOST_SIGMA + 1] = _start(options)
+    m.start[: ballot.IS_GIVEN] = _start(options)
     if options.start.pose is not None:
         _start_at(options.start.pose, options, m)
     m.spread_model[:] = spread_model(options.noise)
@@ -353,6 +353,8 @@ def _start(options: FuseOptions) -> list[float]:
         ballot.MIN_PLACES: start.min_places,
         ballot.LEAD: start.lead,
         ballot.LOST_SIGMA: options.health.lost_sigma,
+        ballot.FEW_VOTES: start.few_votes,
+        ballot.FEW_SPAN_S: start.few_span_s,
     }
     return [float(values[i]) for i in range(len(values))]
 

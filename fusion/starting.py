@@ -5,6 +5,8 @@ from __future__ import annotations
 import math
 
 from fusion.ballot import (
+    FEW_SPAN_S,
+    FEW_VOTES,
     GIVEN_POSE,
     IS_GIVEN,
     LONGEST_WINDOW_S,
@@ -268,7 +270,8 @@ def _found_by_votes(m: Memory, w: Work) -> bool:
     first = first_vote(m, m.start[START_WINDOW_S], 2 * int(m.start[MIN_VOTES]))
     count, span, objects, alike = _agreement(m, w, first, False)
     total = m.counters[VOTE_HEAD] - first
-    if count < max(m.start[MIN_VOTES], m.start[MIN_SHARE] * total):
+    needed = m.start[FEW_VOTES] if span >= m.start[FEW_SPAN_S] else m.start[MIN_VOTES]
+    if count < max(needed, m.start[MIN_SHARE] * total):
         if objects_seen(_ballot(m, w, first)) < m.start[MIN_OBJECTS] or m.start[MAX_TILT] >= math.pi:
             return False
         count, span, objects, alike = _agreement(m, w, first, True)

@@ -80,7 +80,7 @@ RULES: tuple[Rule[Reader], ...] = (
     Rule("odometry.step_s", "odometry beside an IMU", _motion("imu+odometry")),
     Rule("constant_velocity.*", "the motion constant-velocity", _motion("constant-velocity")),
     Rule(
-        "start.min_votes start.min_share start.min_objects start.min_places start.min_span_s",
+        "start.min_votes start.few_* start.min_share start.min_objects start.min_places start.min_span_s",
         "a start without start.pose",
         _asked(lambda o: o.start.pose is None),
     ),

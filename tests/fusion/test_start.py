@@ -138,6 +138,27 @@ def test_two_objects_that_agree_whole_need_no_span_and_one_does():
         fuse(turned_apart, patient)
 
 
+@pytest.mark.parametrize("rate_hz", [1.5, 2.0, 3.0])
+@pytest.mark.parametrize("seed", [1, 2])
+def test_a_slow_sensor_that_sees_one_object_starts_the_filter(rate_hz, seed):
+    """What the IMU integrates from a level guess holds for two or three seconds, not until the seventh vote."""
+    began, away, _ = start_of(table([None], camera_rate_hz=rate_hz, duration_s=15.0, seed=seed))
+    assert began < 3.5 / rate_hz + 1.0
+    assert away < 0.3
+
+
+@pytest.mark.parametrize("rate_hz", [2.0, 15.0])
+def test_votes_that_agree_by_chance_start_nothing(rate_hz):
+    """Each detection of one object shows it somewhere else, turned at random."""
+    for seed in range(5):
+        log, rng = table([None], camera_rate_hz=rate_hz, duration_s=40.0, seed=seed), np.random.default_rng(seed)
+        poses = log.object_poses[""]
+        anywhere = rng.uniform([-0.4, -0.3, 0.6], [0.4, 0.3, 2.0], (len(poses), 3))
+        T_cam_obj = make_pose(Rotation.random(len(poses), rng), anywhere)
+        with pytest.raises(InputError, match="never started"):
+            fuse(replace(log, object_poses={"": replace(poses, T_cam_obj=T_cam_obj)}), OPTIONS)
+
+
 def test_one_object_of_which_every_other_detection_is_flipped_starts_nothing():
     log = table([None])
     poses = log.object_poses[""]
