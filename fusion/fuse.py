@@ -119,6 +119,8 @@ def never_started(problem: Problem, options: FuseOptions) -> InputError:
     file = "T_odom_cam.tum" if problem.motion == "odometry" else "imu.csv"
     span = problem.imu.stamps_ns if len(problem.imu) else poses[:0]
     inside = np.count_nonzero((poses >= span[0]) & (poses <= span[-1])) if len(span) else 0
+    also = {"odometry": " and with the odometry", "constant-velocity": ""}.get(problem.motion, " and with gravity")
+    neither = f"no {begin.min_votes} poses, nor {begin.few_votes} over {begin.few_span_s} s,"
     few = min(begin.few_votes, begin.min_votes)
     if inside < few <= len(poses):
         return InputError(
@@ -127,10 +129,7 @@ def never_started(problem: Problem, options: FuseOptions) -> InputError:
             fix="put both on one clock (poet-loc check tells what they cover), or choose another --motion",
         )
     return InputError(
-        f"the filter never started: no {begin.min_votes} poses, nor {few} over {begin.few_span_s} s, agree"
-        + {"odometry": " with each other and the odometry", "constant-velocity": " with each other"}.get(
-            problem.motion, " with each other and gravity"
-        ),
+        f"the filter never started: {neither} agree with each other{also}",
         path=problem.path,
         fix="see what poet-loc check says of the log, relax --start, or give --start.pose"
         if options.estimate.map != "unknown"
