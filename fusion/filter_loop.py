@@ -13,7 +13,16 @@ from fusion.columns import OUT_CORE, OUT_SIGMA, Columns, Rows
 from fusion.compiled import njit
 from fusion.eskf import ACCEPTED, POSITION_ONLY, REJECTED
 from fusion.filter_motion import advance, begin, find_rate
-from fusion.filter_update import LIMIT_BOTH, follow_jumps, forget_biases, is_lost, is_unsettled, put_object, take
+from fusion.filter_update import (
+    LIMIT_BOTH,
+    follow_jumps,
+    forget_biases,
+    is_lost,
+    is_unsettled,
+    put_object,
+    settle,
+    take,
+)
 from fusion.measurements import OBJECT_POSE, ODOMETRY_STEP
 from fusion.meeting import PUT, START_AGAIN, UNKNOWN_MAP, choose_anchor, forget_rivals, suppose
 from fusion.memory import (
@@ -160,7 +169,7 @@ def measure(m: Memory, w: Work, log: Columns, first: int, last: int) -> None:
             _meet_objects(m, w, log, poses, last)
         account(m, w, log, poses, last)
         if starts(m, w):
-            take_agreed(m, w, log, poses, last)
+            settle_at_agreed(m, w, log, poses, last)
     if first < poses and c[MODE] == TRACKING:
         _clone(m)
 
@@ -182,8 +191,8 @@ def _take_poses(m: Memory, w: Work, log: Columns, first: int, last: int) -> None
 
 
 @njit(cache=True)
-def take_agreed(m: Memory, w: Work, log: Columns, first: int, last: int) -> None:
-    """Take in those poses of a start's stamp that agreed to it: a gross error that came first would win the state.
+def settle_at_agreed(m: Memory, w: Work, log: Columns, first: int, last: int) -> None:
+    """Tie the state to those poses of its start's stamp that agreed: a gross error that came first would win it.
 
     Not while the time offset is unknown: with it, they agreed to a velocity that is not the camera's.
     """
@@ -195,7 +204,7 @@ def take_agreed(m: Memory, w: Work, log: Columns, first: int, last: int) -> None
         if m.vote_stamps[at] == m.counters[NOW] and m.votes[at, VOTE_OBJECT] == log.objects[j]:
             slot -= 1
             if m.inliers[at] & WHOLE and log.decisions[j] == REJECTED:
-                log.decisions[j] = take(m, w, log, j, True)
+                log.decisions[j] = settle(m, w, log, j)
 
 
 @njit(cache=True)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 
-from fusion.ballot import LONGEST_WINDOW_S, LOST_SIGMA, LOST_WINDOW_S, MIN_VOTES, START_WINDOW_S
+from fusion.ballot import FEW_VOTES, LONGEST_WINDOW_S, LOST_SIGMA, LOST_WINDOW_S, MIN_VOTES, START_WINDOW_S
 from fusion.compiled import njit
 from fusion.imu import (
     GUESSED,
@@ -106,11 +106,12 @@ def _looks_anywhere(m: Memory) -> bool:
 def _is_shut_out(m: Memory) -> bool:
     """Tell whether nothing that was seen for long has held a state that needs it: it would go on so."""
     c, known_map = m.counters, m.layout[AT_OBJECTS] < 0
-    if not known_map or c[UNHELD_ROW] < m.start[MIN_VOTES]:
+    few, many = c[UNHELD_ROW] >= m.start[FEW_VOTES], c[UNHELD_ROW] >= m.start[MIN_VOTES]
+    if not known_map or not few:
         return False
     seconds, drifts = (c[NOW] - c[UNHELD_SINCE]) * 1e-9, m.layout[AT_CLONE] < 0 and m.noise[IS_ODOMETRY] == 0.0
     unsure = max(m.P[3, 3], m.P[4, 4], m.P[5, 5]) > m.start[LOST_SIGMA] ** 2
-    return (seconds > m.start[LOST_WINDOW_S] and unsure) or (seconds > m.start[LONGEST_WINDOW_S] and drifts)
+    return (seconds > m.start[LOST_WINDOW_S] and unsure) or (seconds > m.start[LONGEST_WINDOW_S] and drifts and many)
 
 
 @njit(cache=True)

@@ -57,6 +57,26 @@ def take(m: Memory, w: Work, log: Columns, j: int, correcting: bool) -> int:
 
 
 @njit(cache=True)
+def settle(m: Memory, w: Work, log: Columns, j: int) -> int:
+    """Tie a state that has just started to measurement j, which agreed to it, without moving it; return what passed.
+
+    The state is at the mean of all that agreed, which one of them knows less of; what errs with it narrows the gate.
+    """
+    kind, k = log.kinds[j], log.objects[j]
+    read_fitted(m, w, log, j)
+    count = _predict(m, w, kind, k)
+    innovation(m, w, count)
+    decision = gate(w.S, w.residual, m.limits, m.limits[PARTIAL], w.L, w.white, log.nis[j])
+    if decision != ACCEPTED:
+        return REJECTED
+    w.residual[:] = 0.0
+    correct(m, w, 0, 6)
+    if len(m.tape) > 0:
+        note_correction(m, w, 0, 6, count)
+    return ACCEPTED
+
+
+@njit(cache=True)
 def is_unsettled(m: Memory) -> bool:
     """Tell whether the state is unsure of its position."""
     return m.P[3, 3] + m.P[4, 4] + m.P[5, 5] > m.limits[SETTLED]

@@ -172,20 +172,14 @@ class ReferenceFilter:
 
     def take(self, log: Columns, j: int, correcting: bool = True) -> int:
         """Gate measurement j, which is at the filter's stamp, correct with what passes, and return what that was."""
-        kind, k, t_m, nis = int(log.kinds[j]), int(log.objects[j]), log.translations[j], log.nis[j]
-        m, R_m, R = self.m, log.rotations[j].reshape(3, 3), log.covariances[j]
-        if kind == OBJECT_POSE:
-            R = R * m.scales[k]
-            if not m.known[k]:
-                nis[0] = np.inf
-                return REJECTED
-            if m.orders[k] != 1:
-                R_m, R = self._fit_symmetry(k, R_m, R)
-        rate, offset = self.work.rate, self.work.offset[0]
-        residual, H = residual_and_jacobian(kind, k, R_m, t_m, m.x, rate, offset, self.layout)
+        m, kind, k, nis = self.m, int(log.kinds[j]), int(log.objects[j]), log.nis[j]
+        if kind == OBJECT_POSE and not m.known[k]:
+            nis[0] = np.inf
+            return REJECTED
+        residual, H, R = self._predict(log, j)
         self.work.residual[:] = residual
         if kind == OBJECT_POSE:
-            follow_scatter(m, k, t_m, residual)
+            follow_scatter(m, k, log.translations[j], residual)
         decision, status = self.gate(residual, H @ m.P @ H.T + R, nis), status_of(m, kind, k)
         if not correcting:
             return decision
@@ -198,6 +192,25 @@ class ReferenceFilter:
             rows = {ACCEPTED: BOTH, POSITION_ONLY: POSITION_ROWS, ROTATION_ONLY: ROTATION_ROWS}[decision]
             self.correct(residual[rows], H[rows], R[rows, rows])
         return decision if status == ON_MAP else decision | RELEASED
+
+    def _predict(self, log: Columns, j: int) -> tuple[Array, Array, Array]:
+        """Return residual, Jacobian and covariance of measurement j."""
+        m, kind, k = self.m, int(log.kinds[j]), int(log.objects[j])
+        R_m, R = log.rotations[j].reshape(3, 3), log.covariances[j]
+        if kind == OBJECT_POSE:
+            R = R * m.scales[k]
+            if m.orders[k] != 1:
+                R_m, R = self._fit_symmetry(k, R_m, R)
+        rate, offset = self.work.rate, self.work.offset[0]
+        return *residual_and_jacobian(kind, k, R_m, log.translations[j], m.x, rate, offset, self.layout), R
+
+    def _settle(self, log: Columns, j: int) -> int:
+        residual, H, R = self._predict(log, j)
+        decision = self.gate(residual, H @ self.m.P @ H.T + R, log.nis[j])
+        if decision != ACCEPTED:
+            return REJECTED
+        self.correct(0.0 * residual, H, R)
+        return ACCEPTED
 
     def correct(self, residual: Array, H: Array, R: Array) -> None:
         """Update the error state from zero, move the nominal state by it, and carry the covariance along."""
@@ -258,15 +271,15 @@ class ReferenceFilter:
             self.take(log, j, correcting=False)
         return sorted(order, key=lambda j: float(log.nis[j, 0]))
 
-    def _take_agreed(self, log: Columns, first: int, last: int) -> None:
-        """Take in those poses of a start's stamp that agreed to it."""
+    def _settle_at_agreed(self, log: Columns, first: int, last: int) -> None:
+        """Tie the state to those poses of its start's stamp that agreed, without moving it."""
         m, slot = self.m, int(self.m.counters[memory.VOTE_HEAD]) - 1
         for j in reversed(range(first, last if not self.layout.time_offset else first)):
             at = slot % len(m.vote_stamps)
             if m.vote_stamps[at] == m.counters[memory.NOW] and m.votes[at, VOTE_OBJECT] == log.objects[j]:
                 slot -= 1
                 if m.inliers[at] & WHOLE and log.decisions[j] == REJECTED:
-                    log.decisions[j] = self.take(log, j)
+                    log.decisions[j] = self._settle(log, j)
 
     def measure(self, log: Columns, first: int, last: int) -> None:
         """Take in all measurements of one stamp, then see whether to start or to start again."""
@@ -299,7 +312,7 @@ class ReferenceFilter:
                     decisions[j] = ACCEPTED
         filter_loop.account(m, self.work, log, first, last)
         if starts(m, self.work):
-            self._take_agreed(log, first, last)
+            self._settle_at_agreed(log, first, last)
         if odometry < first and self.tracking:
             self.clone()
 

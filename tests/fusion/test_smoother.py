@@ -63,9 +63,9 @@ class FixedPoint(reference_filter.ReferenceFilter):
             self.C[:, anew] = 0.0
             self.started_anew += np.count_nonzero(anew)
 
-    def _take_agreed(self, *arguments):
+    def _settle_at_agreed(self, *arguments):
         self.forget_what_starts_anew()
-        super()._take_agreed(*arguments)
+        super()._settle_at_agreed(*arguments)
 
     def measure(self, *arguments):
         super().measure(*arguments)
