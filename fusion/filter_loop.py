@@ -169,7 +169,7 @@ def measure(m: Memory, w: Work, log: Columns, first: int, last: int) -> None:
             _meet_objects(m, w, log, poses, last)
         account(m, w, log, poses, last)
         if starts(m, w):
-            settle_at_agreed(m, w, log, poses, last)
+            _settle_at_agreed(m, w, log, poses, last)
     if first < poses and c[MODE] == TRACKING:
         _clone(m)
 
@@ -191,7 +191,7 @@ def _take_poses(m: Memory, w: Work, log: Columns, first: int, last: int) -> None
 
 
 @njit(cache=True)
-def settle_at_agreed(m: Memory, w: Work, log: Columns, first: int, last: int) -> None:
+def _settle_at_agreed(m: Memory, w: Work, log: Columns, first: int, last: int) -> None:
     """Tie the state to those poses of its start's stamp that agreed: a gross error that came first would win it.
 
     Not while the time offset is unknown: with it, they agreed to a velocity that is not the camera's.
