@@ -1,6 +1,7 @@
 """The accuracy tables of the documentation: each prints the commands that make it, then what they print.
 
-    python benchmarks/accuracy.py [white network real odometry fitted euroc calibration map] [--runs 50] [--shared DATA]
+    python benchmarks/accuracy.py [white network stated real odometry fitted euroc calibration map]
+        [--runs 50] [--shared DATA]
 
 Simulated tables need nothing else; `real`, `odometry`, `fitted`, `euroc`, half of `calibration` need reference logs.
 """
@@ -22,7 +23,7 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from fusion.calibrated import Calibrated
 from fusion.fit_noise import fit_noise
 from fusion.fuse import fuse
-from fusion.options import DetectionBias, DetectionNoise, Estimate, FuseOptions
+from fusion.options import DetectionBias, DetectionNoise, Estimate, FuseOptions, Gate
 from fusion.result import FuseResult
 from fusion.simulate import SimulationOptions, simulate
 from poet_loc.cli.main import main as poet_loc
@@ -53,6 +54,43 @@ def white(asked: argparse.Namespace) -> None:
 def network(asked: argparse.Namespace) -> None:
     """Network-like noise over many seeds: loose and tight coupling, filter and graph, beside the solver."""
     command("simulate", "--runs", str(asked.runs), "--fusions", *FUSIONS)
+
+
+def stated(asked: argparse.Namespace) -> None:
+    """Poses that state less than their errors: believed as stated, and widened as their innovations say."""
+    columns = [Column("poses"), Column("stated 1-sigma over the true"), Column("estimate")]
+    for way in ("Believed", "Widened (default)"):
+        columns += [Column("RMSE", way, "mm"), Column("NEES/dof", way)]
+    rows = []
+    for noise, poses in (("network", "objects"), ("white", "objects"), ("white", "camera")):
+        for share in (0.25, 0.5, 1.0):
+            for estimator in ("eskf", "graph"):
+                told: list[str] = []
+                for adaptation in (0.0, Gate().adaptation):
+                    options = FuseOptions(estimator, measurements=poses, gate=Gate(adaptation=adaptation))
+                    told += of_stated(noise, share, options, min(asked.runs, 10))
+                rows.append((f"{poses}, {noise}", f"{share:g}", f"fuse/{estimator}/{poses}", *told))
+    print_tables([Table("Overstated poses", tuple(columns), tuple(rows), notes=("10 simulated logs of 60 s a row.",))])
+
+
+def of_stated(noise: Literal["network", "white"], share: float, options: FuseOptions, runs: int) -> tuple[str, str]:
+    """Return RMSE, mm, and NEES/dof over logs whose poses state this share of their 1-sigma."""
+    found = []
+    for seed in range(runs):
+        log = simulate(
+            SimulationOptions(
+                noise=noise,
+                objects=4,
+                symmetric_objects=0,
+                covariances=True,
+                camera_poses=options.measurements == "camera",
+                stated_share=share,
+                seed=seed,
+            )
+        )
+        found.append(errors(fuse(log, options), log))
+    squares, nees = np.mean(found, axis=0)
+    return f"{1e3 * np.sqrt(squares):.1f}", f"{nees:.2f}"
 
 
 def real(asked: argparse.Namespace) -> None:
@@ -220,6 +258,7 @@ def command(*words: str) -> None:
 TABLES: dict[str, Callable[[argparse.Namespace], None]] = {
     "white": white,
     "network": network,
+    "stated": stated,
     "real": real,
     "odometry": odometry,
     "fitted": fitted,

@@ -18,6 +18,7 @@ from fusion.compiled import njit
 from fusion.measurements import OBJECT_POSE, viewing_axes
 from fusion.memory import Memory
 from fusion.nav_state import N_BIAS_KINDS, SPREAD_COUNT, SPREAD_SIZE, SPREADS
+from fusion.noise_scale import PLACE, TURN, scale_of
 from fusion.options import DetectionBias, DetectionNoise
 from fusion.scatter import follow_mean, is_usual_known, spread_by_scatter
 
@@ -87,8 +88,10 @@ def _follow_spread(m: Memory, k: int, R: Array, t: Array) -> None:
     along /= squared
     across = 0.5 * (R[3, 3] + R[4, 4] + R[5, 5] - along)
     floor = model[WHITE_FLOOR] ** 2
+    turning, placing = scale_of(m, OBJECT_POSE, TURN) ** 2, scale_of(m, OBJECT_POSE, PLACE) ** 2
     x[at + SPREAD_COUNT] = min(x[at + SPREAD_COUNT] + 1.0, model[MEAN_OVER])
     gain = 0.5 / x[at + SPREAD_COUNT]
-    follow_mean(x, at, (R[0, 0] + R[1, 1] + R[2, 2]) / (3.0 * model[WHITE_ROTATION] ** 2), gain, math.inf)
-    follow_mean(x, at + 1, across / (model[WHITE_ACROSS] ** 2 * squared + floor), gain, math.inf)
-    follow_mean(x, at + 2, along / (model[WHITE_ALONG] ** 2 * squared + floor), gain, math.inf)
+    turned = turning * (R[0, 0] + R[1, 1] + R[2, 2])
+    follow_mean(x, at, turned / (3.0 * model[WHITE_ROTATION] ** 2), gain, math.inf)
+    follow_mean(x, at + 1, placing * across / (model[WHITE_ACROSS] ** 2 * squared + floor), gain, math.inf)
+    follow_mean(x, at + 2, placing * along / (model[WHITE_ALONG] ** 2 * squared + floor), gain, math.inf)

@@ -8,6 +8,7 @@ from fusion.compiled import njit
 from fusion.measurements import OBJECT_POSE, camera_in_world
 from fusion.memory import Memory, Work
 from fusion.nav_state import OBJECT_SIZE, OBJECTS, TIME_OFFSET, Array, Ints
+from fusion.noise_scale import widen
 from fusion.so3_kernels import multiply_transposed_left
 from fusion.symmetry import fit_symmetry
 
@@ -54,10 +55,10 @@ def read(m: Memory, w: Work, log: Columns, j: int) -> None:
         w.measured[i] = log.rotations[j, i]
     for i in range(3):
         w.measured[9 + i] = log.translations[j, i]
-    scale = m.scales[log.objects[j]] if log.kinds[j] == OBJECT_POSE else 1.0
     for r in range(6):
         for c in range(6):
-            w.R[r, c] = log.covariances[j, r, c] * scale
+            w.R[r, c] = log.covariances[j, r, c]
+    widen(m, log.kinds[j], w.R)
 
 
 @njit(cache=True)

@@ -14,7 +14,9 @@ from fusion.compiled import njit
 from fusion.eskf import ACCEPTED, POSITION_ONLY, REJECTED
 from fusion.filter_motion import advance, begin, find_rate
 from fusion.filter_update import (
+    ADAPTATION,
     LIMIT_BOTH,
+    MAX_SCALE,
     follow_jumps,
     forget_biases,
     is_lost,
@@ -48,8 +50,9 @@ from fusion.memory import (
 )
 from fusion.nav_state import AT_TIME_OFFSET, GYRO_BIAS_ERROR, N_ERROR, N_OBJECTS, TIME_OFFSET, Array, Ints
 from fusion.new_states import clone_pose
+from fusion.noise_scale import follow_scale
 from fusion.object_biases import decay_biases, is_fair
-from fusion.place_watch import RELEASE, return_to_map, tally, watch
+from fusion.place_watch import RELEASE, RELEASED, return_to_map, tally, watch
 from fusion.refused_odometry import follow_refusals
 from fusion.starting import cast_vote, start_again, starts
 from fusion.tape import note_clone, note_decay, note_row
@@ -273,6 +276,8 @@ def account(m: Memory, w: Work, log: Columns, first: int, last: int) -> None:
         refused += decision == REJECTED
         if c[MODE] == TRACKING:
             tally(m, kind, k, decision, log.nis[j, 0], m.limits[LIMIT_BOTH])
+            if m.limits[ADAPTATION] > 0.0 and decision & RELEASED == 0:
+                follow_scale(m, kind, k, log.nis[j], m.limits[ADAPTATION], m.limits[MAX_SCALE])
     if c[MODE] != TRACKING:
         return
     if c[UNHELD_ROW] == 0:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 
 from fusion.columns import Columns, read, read_fitted
@@ -44,8 +42,6 @@ def take(m: Memory, w: Work, log: Columns, j: int, correcting: bool) -> int:
         decision = REJECTED
     if not correcting:
         return decision
-    if kind == OBJECT_POSE and m.limits[ADAPTATION] > 0.0:
-        adapt_scale(m, k, nis[0])
     if status != ON_MAP:
         decision = POSITION_ONLY if status == TURNED and nis[2] <= m.limits[LIMIT_POSITION] else REJECTED
     if decision != REJECTED:
@@ -112,14 +108,6 @@ def _predict(m: Memory, w: Work, kind: int, k: int) -> int:
     """Write residual and Jacobian of the measurement in w.measured; return how many columns H has."""
     R_m, t_m, offset = w.measured[0:9], w.measured[9:12], w.offset[0]
     return residual_and_jacobian(kind, k, R_m, t_m, m.x, w.rate, offset, m.layout, w.residual, w.H, m.columns, w.step)
-
-
-@njit(cache=True)
-def adapt_scale(m: Memory, k: int, nis: float) -> None:
-    """Follow how large an object's innovations are against their stated size, gross errors capped."""
-    ratio = min(nis / 6.0, 4.0)
-    scale = m.scales[k] * math.exp(m.limits[ADAPTATION] * (ratio - 1.0))
-    m.scales[k] = min(max(scale, 1.0), m.limits[MAX_SCALE])
 
 
 @njit(cache=True)

@@ -18,6 +18,7 @@ from fusion.eskf import POSITION_ONLY, ROTATION_ONLY
 from fusion.first_map import with_first_map
 from fusion.health import run_health
 from fusion.measurements import ODOMETRY_STEP, Measurements
+from fusion.noise_scale import widening
 from fusion.options import FuseOptions
 from fusion.place_watch import RELEASED
 from fusion.prepare import Problem, fill_memory, pose_problem
@@ -88,9 +89,8 @@ def run_filter(
         ),
         gate_log(problem, columns.decisions, columns.nis),
         time.perf_counter() - began,
-        int(m.counters[memory.RESTARTS]),
     )
-    return replace(result, motion=problem.motion, body=problem.body, calibrated=calibrated(m, problem))
+    return with_findings(result, problem, m)
 
 
 def loop_columns(problem: Problem) -> tuple[Columns, Rows]:
@@ -137,12 +137,23 @@ def never_started(problem: Problem, options: FuseOptions) -> InputError:
     )
 
 
+def with_findings(result: FuseResult, problem: Problem, m: memory.Memory) -> FuseResult:
+    """Return a result with what its problem says of it and what its filter's memory holds in the end."""
+    return replace(
+        result,
+        motion=problem.motion,
+        body=problem.body,
+        restarts=int(m.counters[memory.RESTARTS]),
+        calibrated=calibrated(m, problem),
+        noise_scale=widening(m),
+    )
+
+
 def result_from_rows(
     name: str,
     rows: tuple[NDArray[np.int64], Array, Array, Array],
     gate: GateLog,
     runtime_s: float,
-    restarts: int = 0,
 ) -> FuseResult:
     """Turn rows (stamps, nominal core (N, 21), sigmas (N, 15), covariances (N, 6, 6)) into a result."""
     stamps, core, sigma, covariance = rows
@@ -160,7 +171,6 @@ def result_from_rows(
         pose_covariances=covariance,
         gate=gate,
         runtime_s=runtime_s,
-        restarts=restarts,
     )
 
 

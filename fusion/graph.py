@@ -3,12 +3,9 @@
 from __future__ import annotations
 
 import time
-from dataclasses import replace
 
-from fusion import memory
-from fusion.calibrated import calibrated
 from fusion.coarse_offset import retimed
-from fusion.fuse import gate_log, never_started, result_from_rows, run_filter
+from fusion.fuse import gate_log, never_started, result_from_rows, run_filter, with_findings
 from fusion.graph_batch import run_batch
 from fusion.graph_fixed import new_builder
 from fusion.graph_motion import MotionChain
@@ -70,6 +67,5 @@ def run_fixed_lag(problem: Problem, options: FuseOptions) -> FuseResult:
         walk.rows,
         gate_log(problem, walk.columns.decisions, walk.columns.nis),
         time.perf_counter() - began,
-        int(m.counters[memory.RESTARTS]),
     )
-    return replace(result, motion=problem.motion, body=problem.body, calibrated=calibrated(m, problem))
+    return with_findings(result, problem, m)

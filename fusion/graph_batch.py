@@ -11,10 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fusion import eskf, memory
-from fusion.calibrated import calibrated
 from fusion.eskf import ACCEPTED
 from fusion.filter_update import PARTIAL
-from fusion.fuse import gate_log, never_started, result_from_rows
+from fusion.fuse import gate_log, never_started, result_from_rows, with_findings
 from fusion.graph_builder import GraphBuilder
 from fusion.graph_factors import Detection, error_at
 from fusion.graph_gnc import Truncation, anneal
@@ -92,10 +91,8 @@ def run_batch(problem: Problem, options: FuseOptions) -> FuseResult:
         walk.rows,
         gate_log(problem, walk.columns.decisions, walk.columns.nis),
         time.perf_counter() - began,
-        int(walk.memory.counters[memory.RESTARTS]),
     )
-    found = calibrated(walk.memory, problem)
-    return replace(result, motion=problem.motion, body=problem.body, calibrated=found)
+    return with_findings(result, problem, walk.memory)
 
 
 def _stretches(walk: Walk) -> Iterator[Stretch]:

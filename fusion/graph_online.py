@@ -31,6 +31,7 @@ from fusion.graph_walk import HERE, IMU_ROW, NEXT, ROWS, Walk
 from fusion.imu_noise import REACH, follow_noise
 from fusion.measurements import Measurements
 from fusion.nav_state import StateLayout
+from fusion.noise_scale import widening
 from fusion.online import Estimator, Health
 from fusion.online_input import OnlineOptions
 from fusion.options import FuseOptions
@@ -130,6 +131,7 @@ class GraphEstimator(Estimator):
             self._not_in_map,
             self._replays,
             self._clock_jumps,
+            widening(self.memory),
             self._object_health(),
         )
 

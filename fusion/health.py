@@ -27,8 +27,9 @@ Mode = Literal["initialising", "tracking", "coasting", "lost"]
 MODES: tuple[Mode, ...] = ("initialising", "tracking", "coasting", "lost")
 Key = tuple[int, int]
 
-FEW_USED, LONG_LOST, LONG_MISSED_S = 2.0 / 3.0, 0.01, 1.0
-"""What `troubles` tells: a smaller share of poses used, a larger share of time lost, poses so long after the end, s."""
+FEW_USED, WIDENED, LONG_LOST, LONG_MISSED_S = 2.0 / 3.0, 1.5, 0.01, 1.0
+"""What `troubles` tells: a smaller share of poses used, noise taken so many times larger than stated, a larger share of
+time lost, poses so long after the end, s."""
 
 
 @dataclass(frozen=True)
@@ -67,6 +68,8 @@ class RunHealth:
     """Who was released from the map (or in rotation only), from the first to the last pose left out for it, ns."""
     restarts: int
     """How often the filter was lost and started again."""
+    noise_scale: tuple[float, float]
+    """How many times larger than stated the poses' 1-sigma of rotation and of position was taken in the end."""
 
     def mode_at(self, stamps_ns: Stamps) -> NDArray[np.str_]:
         """Return the mode at each of N stamps."""
@@ -107,7 +110,7 @@ def run_health(result: FuseResult, options: FuseOptions, begin_ns: int) -> RunHe
         objects[key] = _object(gate, own, limit)
         released += [(key, int(gate.stamps_ns[a]), int(gate.stamps_ns[b])) for a, b in _runs(gate.released[own], own)]
     end = int(result.stamps_ns[-1])
-    return RunHealth(since, modes, end, objects, tuple(released), result.restarts)
+    return RunHealth(since, modes, end, objects, tuple(released), result.restarts, result.noise_scale)
 
 
 def _modes(result: FuseResult, options: HealthOptions) -> NDArray[np.int64]:
@@ -173,6 +176,9 @@ def troubles(result: FuseResult) -> list[str]:
         found.append(f"used {100.0 * used:.0f} % of the poses")
     if health.restarts:
         found.append(f"started again {health.restarts} times" if health.restarts > 1 else "started again once")
+    if max(health.noise_scale) > WIDENED:
+        turn, place = health.noise_scale
+        found.append(f"took the 1-sigma of the poses {turn:.1f} (rotation) and {place:.1f} (position) times larger")
     if health.share("lost") > LONG_LOST:
         found.append(f"was lost for {100.0 * health.share('lost'):.0f} % of the time")
     missed_s = float(result.gate.stamps_ns[-1] - result.stamps_ns[-1]) * 1e-9 if len(result.gate) else 0.0
@@ -188,6 +194,7 @@ def as_plain(health: RunHealth) -> dict[str, Any]:
         "end_ns": health.end_ns,
         "share_of_time": {mode: round(health.share(mode), 6) for mode in MODES},
         "restarts": health.restarts,
+        "noise_scale": dict(zip(("rotation", "position"), map(_number, health.noise_scale))),
         "objects": [_plain_object(key, each) for key, each in health.objects.items()],
         "released": [
             {"object_id": key[0], "instance": key[1], "from_ns": first, "to_ns": last}

@@ -48,6 +48,7 @@ INITIALISING, TRACKING = 0, 1
 
 TALLY_SIZE, PLACE_SIZE = 8, 15  # rows of tallies and places, see place_watch.py
 SCATTER_SIZE = 11  # see scatter.py
+SCALE_SIZE = 3  # see noise_scale.py
 SUPPOSED, SUPPOSED_SIZE = 6, 16  # hypotheses of each unknown object's pose, see meeting.py
 
 # Integer header: where things stand in the float buffer, sizes.
@@ -97,7 +98,7 @@ class Memory(NamedTuple):
 
     x: Array
     P: Array
-    scales: Array  # (K,) how much larger than stated each object's noise has shown itself
+    scales: Array  # (2, .) how much larger than stated object and camera poses err: places in noise_scale.py
     refused: Array  # (K, 2) how often in a row each object's rotation and position were refused
     known: Array  # (K,) 1 where an object's pose in the world is known, 0 before it was first seen
     tallies: Array  # (K + 1, .) how the measurements of each object, and camera poses, fared: places in place_watch.py
@@ -135,7 +136,7 @@ def allocate(layout: StateLayout) -> tuple[Array, Ints]:
     sizes: Sequence[tuple[int, int]] = (
         (AT_X, nx),
         (AT_P, n * n),
-        (AT_SCALES, max(K, 1)),
+        (AT_SCALES, 2 * SCALE_SIZE),
         (AT_REFUSED, 2 * max(K, 1)),
         (AT_KNOWN, max(K, 1)),
         (AT_TALLIES, TALLY_SIZE * (max(K, 1) + 1)),
@@ -199,7 +200,7 @@ def views(floats: Array, integers: Ints) -> Memory:
     return Memory(
         f[i[AT_X] : i[AT_X] + nx],
         f[i[AT_P] : i[AT_P] + n * n].reshape((n, n)),
-        f[i[AT_SCALES] : i[AT_SCALES] + K],
+        f[i[AT_SCALES] : i[AT_SCALES] + 2 * SCALE_SIZE].reshape((2, SCALE_SIZE)),
         f[i[AT_REFUSED] : i[AT_REFUSED] + 2 * K].reshape((K, 2)),
         f[i[AT_KNOWN] : i[AT_KNOWN] + K],
         f[i[AT_TALLIES] : i[AT_TALLIES] + TALLY_SIZE * (K + 1)].reshape((K + 1, TALLY_SIZE)),

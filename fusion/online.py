@@ -37,6 +37,7 @@ from fusion.measurements import (
 )
 from fusion.motion_source import odometry_spread, scaled_noise
 from fusion.nav_state import ACCEL_BIAS, CORE, GYRO_BIAS, POSITION, VELOCITY, StateLayout
+from fusion.noise_scale import widening
 from fusion.online_input import ImuClock, OnlineOptions, shaped, vector
 from fusion.options import FuseOptions
 from fusion.place_watch import (
@@ -116,6 +117,8 @@ class Health:
     """How often something late was put in its place."""
     clock_jumps: int
     """How often the IMU's clock was set back and all before forgotten, these counts too."""
+    noise_scale: tuple[float, float]
+    """How many times larger than stated the poses' 1-sigma of rotation and of position is taken now."""
     objects: dict[tuple[int, int], ObjectHealth]
     """By (object_id, instance); (-1, 0) for camera poses."""
 
@@ -316,6 +319,7 @@ class Estimator:
             self._not_in_map,
             int(h[replay_memory.REPLAYS]),
             self._clock_jumps,
+            widening(self.memory),
             self._object_health(),
         )
 

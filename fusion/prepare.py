@@ -19,6 +19,7 @@ from fusion.known_errors import known_errors
 from fusion.measurements import CAMERA_POSE, OBJECT_POSE, Measurements, ray_aligned_covariance
 from fusion.motion_source import Kind, motion_source, odometry_steps
 from fusion.nav_state import ACCEL_BIAS_ERROR, CORE, GYRO_BIAS_ERROR, VELOCITY_ERROR, StateLayout, nominal_state
+from fusion.noise_scale import FOLLOWED
 from fusion.options import DetectionBias, FuseOptions
 from fusion.scatter import LAST_NS, usual_scatter
 from poet_loc.core.consistency import chi_square_quantile
@@ -249,7 +250,7 @@ def fill_memory(problem: Problem, options: FuseOptions) -> tuple[Array, NDArray[
             if landmark.symmetry is not None:
                 m.axes[k] = landmark.symmetry.axis
                 m.orders[k] = 0 if landmark.symmetry.order == "continuous" else landmark.symmetry.order
-    m.scales[:] = 1.0
+    m.scales[:, :FOLLOWED] = 1.0
     return floats, integers
 
 

@@ -33,6 +33,7 @@ from fusion.nav_state import (
     put_pose,
     retract_state,
 )
+from fusion.noise_scale import PLACE, TURN, scale_of
 from fusion.object_biases import BIAS_JUMP, BIAS_JUMP_AT, BIAS_MODEL_SIZE, bias_phi, bias_sigma
 from fusion.options import FuseOptions
 from fusion.place_watch import ON_MAP, RELEASED, TURNED, status_of
@@ -186,8 +187,6 @@ class ReferenceFilter:
         if status != ON_MAP:
             fits = status == TURNED and nis[2] <= m.limits[filter_update.LIMIT_POSITION]
             decision = POSITION_ONLY if fits else REJECTED
-        if kind == OBJECT_POSE and m.limits[filter_update.ADAPTATION] > 0.0:
-            filter_update.adapt_scale(m, k, nis[0])
         if decision != REJECTED:
             rows = {ACCEPTED: BOTH, POSITION_ONLY: POSITION_ROWS, ROTATION_ONLY: ROTATION_ROWS}[decision]
             self.correct(residual[rows], H[rows], R[rows, rows])
@@ -196,13 +195,16 @@ class ReferenceFilter:
     def _predict(self, log: Columns, j: int) -> tuple[Array, Array, Array]:
         """Return residual, Jacobian and covariance of measurement j."""
         m, kind, k = self.m, int(log.kinds[j]), int(log.objects[j])
-        R_m, R = log.rotations[j].reshape(3, 3), log.covariances[j]
-        if kind == OBJECT_POSE:
-            R = R * m.scales[k]
-            if m.orders[k] != 1:
-                R_m, R = self._fit_symmetry(k, R_m, R)
+        R_m, R = log.rotations[j].reshape(3, 3), self._widened(log, j)
+        if kind == OBJECT_POSE and m.orders[k] != 1:
+            R_m, R = self._fit_symmetry(k, R_m, R)
         rate, offset = self.work.rate, self.work.offset[0]
         return *residual_and_jacobian(kind, k, R_m, log.translations[j], m.x, rate, offset, self.layout), R
+
+    def _widened(self, log: Columns, j: int) -> Array:
+        """Return the covariance of measurement j, as much larger than stated as its kind's errors are."""
+        root = np.repeat([scale_of(self.m, log.kinds[j], part) for part in (TURN, PLACE)], 3)
+        return np.asarray(root[:, None] * log.covariances[j] * root)
 
     def _settle(self, log: Columns, j: int) -> int:
         residual, H, R = self._predict(log, j)
@@ -232,7 +234,7 @@ class ReferenceFilter:
         With 0 = H_x dx + H_o do + e its error is do = -H_o^-1 (H_x dx + e).
         """
         m, layout, x, k = self.m, self.layout, self.m.x, int(log.objects[j])
-        R_m, t_m, R = log.rotations[j].reshape(3, 3), log.translations[j], log.covariances[j] * m.scales[k]
+        R_m, t_m, R = log.rotations[j].reshape(3, 3), log.translations[j], self._widened(log, j)
         rate, offset, at = self.work.rate, self.work.offset[0], OBJECTS + OBJECT_SIZE * k
         T_world_imu = make_pose(
             Rotation.from_matrix(x[:9].reshape(3, 3) @ exp((x[TIME_OFFSET] - offset) * rate)),

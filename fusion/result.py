@@ -69,6 +69,8 @@ class FuseResult:
     """Whose trajectory T_world_imu is: the camera's where the log says nothing of an IMU."""
     restarts: int = 0
     """How often the filter was lost and started again."""
+    noise_scale: tuple[float, float] = (1.0, 1.0)
+    """How many times larger than stated the poses' 1-sigma of rotation and of position was taken in the end."""
     calibrated: Calibrated | None = None
     """Extrinsics, time offset, gravity and map as they were last estimated; None where all were taken as given."""
     health: RunHealth | None = None

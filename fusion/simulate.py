@@ -163,7 +163,7 @@ def _camera_poses(
         stamps_ns,
         np.arange(len(stamps_ns), dtype=np.int64),
         make_pose(T_world_cam.rotation * Rotation.from_rotvec(errors[:, :3]), T_world_cam.translation + errors[:, 3:]),
-        np.broadcast_to(np.diag(sigma**2), (len(stamps_ns), 6, 6)).copy(),
+        np.broadcast_to(np.diag((options.stated_share * sigma) ** 2), (len(stamps_ns), 6, 6)).copy(),
     )
 
 

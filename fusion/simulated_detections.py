@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from fusion.detection_errors import covariance_in_camera_axes, ray_axes, run_numbers, runs, to_camera_axes
-from fusion.simulation_options import SimulationOptions
+from fusion.simulation_options import SimulationOptions, writes_covariances
 from poet_loc.core.geometry import make_pose
 from poet_loc.core.records import Calibration, LandmarkMap, ObjectPoses
 
@@ -44,7 +44,6 @@ def detect_objects(
     frame, column = np.nonzero(seen)
     turn = Rotation.from_rotvec(inlier[seen][:, :3]).as_matrix()
     rotation = (wrong_turn[frame, column] @ turn @ R_cam_obj[seen]) @ look_alike[seen]
-    write = options.noise == "white" if options.covariances is None else options.covariances
     scores = stream("scores").uniform(0.5, 1.0, seen.shape) - 0.2 * gross
     detections = ObjectPoses(
         stamps_ns[frame],
@@ -53,7 +52,9 @@ def detect_objects(
         np.zeros(len(frame), dtype=np.int64),
         np.asarray(np.round(scores[seen], 3), dtype=float),
         make_pose(Rotation.from_matrix(rotation), (points + inlier[..., 3:] + wrong_place)[seen]),
-        covariance_in_camera_axes(sigmas[seen], R_cam_ray[seen]) if write else None,
+        covariance_in_camera_axes(options.stated_share * sigmas[seen], R_cam_ray[seen])
+        if writes_covariances(options)
+        else None,
     )
     errors = {"inlier_errors": inlier, "slow_errors": slow, "gross": gross, "flipped": flipped}
     return detections, {name: each[seen] for name, each in errors.items()}

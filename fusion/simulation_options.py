@@ -51,6 +51,8 @@ class SimulationOptions:
     """Errors of the object poses: none, white with the covariance written, or like a real network's."""
     covariances: bool | None = None
     """Write the object poses' covariances (of the inlier error); None: with white noise only."""
+    stated_share: float = 1.0
+    """Written covariances, of object and camera poses, state this share of the true 1-sigma."""
     white: WhiteErrors = field(default_factory=WhiteErrors)
     """Errors of `noise` white."""
     network: NetworkErrors = field(default_factory=NetworkErrors)
@@ -93,7 +95,7 @@ class SimulationOptions:
     def __post_init__(self) -> None:
         refuse_other_words(self)
         within("[0.5, inf)", self, "duration_s")
-        within("(0, inf)", self, "imu_rate_hz", "camera_rate_hz")
+        within("(0, inf)", self, "imu_rate_hz", "camera_rate_hz", "stated_share")
         within("[1, inf)", self, "objects")
         within("[-1, inf)", self, "moved.object")
         within("(-inf, inf)", self, "timeshift_cam_imu_s", "stamp_delay_s", "moved.distance", "moved.turn_deg")
@@ -135,6 +137,11 @@ _SIZES = (
 )
 
 
+def writes_covariances(options: SimulationOptions) -> bool:
+    """Tell whether the object poses state their covariances."""
+    return options.noise == "white" if options.covariances is None else options.covariances
+
+
 def refuse_unread(options: SimulationOptions) -> None:
     """Raise InputError for an option that is not at its default although nothing reads it."""
     unread_options.refuse_unread(options, SimulationOptions(), [options], RULES)
@@ -146,6 +153,7 @@ def _asked(ask: Callable[[SimulationOptions], Any]) -> Callable[[SimulationOptio
 
 RULES: tuple[Rule[SimulationOptions], ...] = (
     Rule("white.*", "noise white", _asked(lambda o: o.noise == "white" or (o.noise == "none" and o.covariances))),
+    Rule("stated_share", "covariances or camera-poses", _asked(lambda o: o.camera_poses or writes_covariances(o))),
     Rule("network.*", "noise network", _asked(lambda o: o.noise == "network")),
     Rule("network.gross_run_s", "network.gross-share", _asked(lambda o: o.network.gross_share)),
     Rule(

@@ -8,15 +8,14 @@ memory needed does not grow with the log, but for the results. Smoothed results 
 from __future__ import annotations
 
 import time
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from fusion import filter_loop, memory, tape
-from fusion.calibrated import calibrated
 from fusion.columns import OUT_CORE, Columns, Rows
-from fusion.fuse import gate_log, loop_columns, never_started, result_from_rows
+from fusion.fuse import gate_log, loop_columns, never_started, result_from_rows, with_findings
 from fusion.nav_state import CORE, StateLayout
 from fusion.options import FuseOptions
 from fusion.prepare import Problem, fill_memory
@@ -58,9 +57,8 @@ def run_smoother(problem: Problem, options: FuseOptions) -> FuseResult:
         (rows.stamps[: len(core)], core, sigma, np.ascontiguousarray(covariance[:, :6, :6])),
         gate_log(problem, columns.decisions, columns.nis),
         time.perf_counter() - began,
-        int(m.counters[memory.RESTARTS]),
     )
-    return replace(result, motion=problem.motion, body=problem.body, calibrated=calibrated(m, problem))
+    return with_findings(result, problem, m)
 
 
 def smooth(problem: Problem, floats: Array, integers: Stamps) -> tuple[Columns, Rows, Array, Array]:

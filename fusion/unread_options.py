@@ -47,10 +47,7 @@ def _asked(ask: Callable[[FuseOptions], Any]) -> Callable[[Reader], bool]:
     return lambda reader: bool(ask(reader.options))
 
 
-_OF_OBJECTS = (
-    "noise.* bias.* moved.* meeting.* estimate.map prior.map_* "
-    "gate.adaptation gate.max_noise_scale start.min_objects start.min_places"
-)
+_OF_OBJECTS = "noise.* bias.* moved.* meeting.* estimate.map prior.map_* start.min_objects start.min_places"
 
 RULES: tuple[Rule[Reader], ...] = (
     Rule("graph.*", "the estimators graph and batch", _estimator("graph", "batch")),

@@ -26,7 +26,7 @@ from fusion.graph_walk import Walk
 from fusion.measurements import ODOMETRY_STEP
 from fusion.memory import CLONED
 from fusion.nav_state import EXTRINSIC_ROTATION, StateLayout, local_state, pose_at, put_pose
-from fusion.options import DetectionBias, Estimate, FuseOptions, Graph, Odometry, Prior
+from fusion.options import DetectionBias, Estimate, FuseOptions, Gate, Graph, Odometry, Prior
 from fusion.prepare import pose_problem
 from fusion.reference_models import residual_and_jacobian
 from fusion.simulate import SimulationOptions, simulate
@@ -106,7 +106,8 @@ def test_the_clones_error_is_the_filters():
 def test_a_lag_of_one_keyframe_is_the_filter_with_its_clone(shift_s, estimate):
     """Odometry's stamps stand among the keyframes, wherever they fall; a step outlasts the lag, and a gap does too."""
     nearly_right = Prior(extrinsic_rotation_deg=0.5, extrinsic_position=0.005)  # so that all is linear
-    options = replace(BOTH, estimate=estimate, prior=nearly_right, bias=DetectionBias(use=False))
+    believing = {"bias": DetectionBias(use=False), "gate": Gate(adaptation=0.0)}
+    options = replace(BOTH, estimate=estimate, prior=nearly_right, **believing)
     problem = pose_problem(log_with_odometry(shift_s, (2.0, 3.5), noise="white"), options)
     causal = run_filter(problem, options)
     graph = run_graph(problem, replace(options, estimator="graph", graph=EVERY_STAMP))

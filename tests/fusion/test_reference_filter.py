@@ -11,7 +11,8 @@ from filter_runs import LAYOUTS, assert_same, run, simulated
 from fusion import filter_loop, memory, reference_filter
 from fusion.fuse import run_filter
 from fusion.measurements import ODOMETRY_STEP
-from fusion.options import DetectionBias, DetectionNoise, Estimate, FuseOptions, Gate
+from fusion.noise_scale import FOLLOWED
+from fusion.options import DetectionBias, DetectionNoise, Estimate, FuseOptions
 from fusion.prepare import pose_problem
 from poet_loc.io.log_folder import read_log
 
@@ -25,11 +26,14 @@ def test_compiled_is_plain_on_objects(layout, noise):
     assert np.count_nonzero(compiled.decisions) > 50
 
 
-def test_compiled_is_plain_on_camera_poses():
+@pytest.mark.parametrize("stated", [1.0, 0.4])
+def test_compiled_is_plain_on_camera_poses(stated):
     problem, options = simulated("camera"), FuseOptions(measurements="camera")
+    problem.measurements.covariances[:] *= stated**2
     compiled, plain = (run(loop, problem, options) for loop in (filter_loop.run_log, reference_filter.run_log))
     assert_same(compiled, plain)
-    assert np.count_nonzero(compiled.decisions) > 50
+    assert np.count_nonzero(compiled.decisions) > 40
+    assert (stated == 1.0) == np.all(compiled.memory.scales[1, :FOLLOWED] < 1.2)
 
 
 def test_compiled_is_plain_through_an_imu_gap_and_with_noise_that_adapts():
@@ -37,10 +41,11 @@ def test_compiled_is_plain_through_an_imu_gap_and_with_noise_that_adapts():
     stamps = problem.imu.stamps_ns
     kept = (stamps < stamps[250]) | (stamps > stamps[300])
     problem = replace(problem, imu=problem.imu[kept][:-40])  # and measurements beyond the end
-    options = FuseOptions(gate=Gate(adaptation=0.05))
+    problem.measurements.covariances[:] /= 9.0
+    options = FuseOptions()
     compiled, plain = (run(loop, problem, options) for loop in (filter_loop.run_log, reference_filter.run_log))
     assert_same(compiled, plain)
-    assert np.any(compiled.memory.scales > 1.0)
+    assert np.all(compiled.memory.scales[0, :FOLLOWED] > 1.2)
 
 
 def test_compiled_is_plain_where_one_part_of_a_bias_never_changes():

@@ -221,7 +221,8 @@ class BatchLeastSquares:
 
 @pytest.mark.parametrize("measurements", ["camera", "objects"])
 def test_smoothed_is_batch_least_squares_where_the_problem_is_linear(measurements):
-    options = FuseOptions(measurements=measurements, gate=Gate(probability=1.0), bias=DetectionBias(use=False))
+    believing = Gate(probability=1.0, adaptation=0.0)
+    options = FuseOptions(measurements=measurements, gate=believing, bias=DetectionBias(use=False))
     problem = simulated(
         measurements,
         options=options,

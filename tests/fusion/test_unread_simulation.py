@@ -30,7 +30,13 @@ def names() -> list[str]:
     plain = [each.name for each in fields(SHORT) if each.name.startswith(("camera_pose_", "odometry_"))]
     inside = [f"{group}.{each.name}" for group in GROUPS for each in fields(getattr(SHORT, group))]
     assert all(is_dataclass(getattr(SHORT, group)) for group in GROUPS)
-    return [*plain, "gyroscope_bias_sigma", "accelerometer_bias_sigma", *(n for n in inside if n != "moved.object")]
+    return [
+        *plain,
+        "stated_share",
+        "gyroscope_bias_sigma",
+        "accelerometer_bias_sigma",
+        *(n for n in inside if n != "moved.object"),
+    ]
 
 
 def is_refused(base: SimulationOptions, name: str) -> bool:
@@ -47,6 +53,7 @@ def numbers(options: SimulationOptions) -> np.ndarray:
     parts = [log.imu.specific_force, log.imu.angular_velocity, *(each.T_cam_obj.as_matrix() for each in poses)]
     parts += [each.covariances for each in poses if each.covariances is not None]
     parts += [] if log.camera_poses is None else [log.camera_poses.T_world_cam.as_matrix()]
+    parts += [] if log.camera_poses is None else [log.camera_poses.covariances]
     parts += [] if log.T_odom_cam is None else [log.T_odom_cam.T_world_body.as_matrix()]
     return np.concatenate([part.ravel() for part in parts])
 
@@ -71,9 +78,15 @@ def test_what_is_refused_changes_no_number(choice):
 
 FELT = {
     "network": ["network.across_m", "network.gross_run_s", "network.correlation_time_s", "gyroscope_bias_sigma"],
-    "white": ["white.across_m", "white.rotation_deg"],
+    "white": ["white.across_m", "white.rotation_deg", "stated_share"],
     "exact with covariances": ["white.along_of_depth"],
-    "everything": ["moved.distance", "moved.until_s", "camera_pose_position_sigma_m", "odometry_position_drift"],
+    "everything": [
+        "moved.distance",
+        "moved.until_s",
+        "stated_share",
+        "camera_pose_position_sigma_m",
+        "odometry_position_drift",
+    ],
 }
 
 
