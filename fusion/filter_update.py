@@ -32,12 +32,8 @@ def take(m: Memory, w: Work, log: Columns, j: int, correcting: bool) -> int:
     if kind == OBJECT_POSE and m.known[k] == 0.0:
         nis[0] = np.inf
         return REJECTED
-    read_fitted(m, w, log, j)
-    count = _predict(m, w, kind, k)
-    if kind == OBJECT_POSE:
-        follow_scatter(m, k, log.translations[j], w.residual)
-    innovation(m, w, count)
-    decision, status = gate(w.S, w.residual, m.limits, m.limits[PARTIAL], w.L, w.white, nis), status_of(m, kind, k)
+    count, decision = _meet_gate(m, w, log, j)
+    status = status_of(m, kind, k)
     if is_far(m, w.residual) or (decision == POSITION_ONLY and is_blunder(m, nis[1])):
         decision = REJECTED
     if not correcting:
@@ -45,10 +41,7 @@ def take(m: Memory, w: Work, log: Columns, j: int, correcting: bool) -> int:
     if status != ON_MAP:
         decision = POSITION_ONLY if status == TURNED and nis[2] <= m.limits[LIMIT_POSITION] else REJECTED
     if decision != REJECTED:
-        first, size = 3 if decision == POSITION_ONLY else 0, 6 if decision == ACCEPTED else 3
-        correct(m, w, first, size)
-        if len(m.tape) > 0:
-            note_correction(m, w, first, size, count)
+        _correct(m, w, 3 if decision == POSITION_ONLY else 0, 6 if decision == ACCEPTED else 3, count)
     return decision if status == ON_MAP else decision | RELEASED
 
 
@@ -58,18 +51,32 @@ def settle(m: Memory, w: Work, log: Columns, j: int) -> int:
 
     The state is at the mean of all that agreed, which one of them knows less of; what errs with it narrows the gate.
     """
-    kind, k = log.kinds[j], log.objects[j]
-    read_fitted(m, w, log, j)
-    count = _predict(m, w, kind, k)
-    innovation(m, w, count)
-    decision = gate(w.S, w.residual, m.limits, m.limits[PARTIAL], w.L, w.white, log.nis[j])
+    count, decision = _meet_gate(m, w, log, j)
     if decision != ACCEPTED:
         return REJECTED
     w.residual[:] = 0.0
-    correct(m, w, 0, 6)
-    if len(m.tape) > 0:
-        note_correction(m, w, 0, 6, count)
+    _correct(m, w, 0, 6, count)
     return ACCEPTED
+
+
+@njit(cache=True)
+def _meet_gate(m: Memory, w: Work, log: Columns, j: int) -> tuple[int, int]:
+    """Write measurement j's innovation and NIS; return how many columns H has, and what the gate lets through."""
+    kind, k = log.kinds[j], log.objects[j]
+    read_fitted(m, w, log, j)
+    count = _predict(m, w, kind, k)
+    if kind == OBJECT_POSE:
+        follow_scatter(m, k, log.translations[j], w.residual)
+    innovation(m, w, count)
+    return count, gate(w.S, w.residual, m.limits, m.limits[PARTIAL], w.L, w.white, log.nis[j])
+
+
+@njit(cache=True)
+def _correct(m: Memory, w: Work, first: int, size: int, count: int) -> None:
+    """Take in rows first..first+size of the measurement whose innovation was written."""
+    correct(m, w, first, size)
+    if len(m.tape) > 0:
+        note_correction(m, w, first, size, count)
 
 
 @njit(cache=True)

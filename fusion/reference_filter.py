@@ -177,11 +177,8 @@ class ReferenceFilter:
         if kind == OBJECT_POSE and not m.known[k]:
             nis[0] = np.inf
             return REJECTED
-        residual, H, R = self._predict(log, j)
-        self.work.residual[:] = residual
-        if kind == OBJECT_POSE:
-            follow_scatter(m, k, log.translations[j], residual)
-        decision, status = self.gate(residual, H @ m.P @ H.T + R, nis), status_of(m, kind, k)
+        residual, H, R, decision = self._meet_gate(log, j)
+        status = status_of(m, kind, k)
         if not correcting:
             return decision
         if status != ON_MAP:
@@ -191,6 +188,14 @@ class ReferenceFilter:
             rows = {ACCEPTED: BOTH, POSITION_ONLY: POSITION_ROWS, ROTATION_ONLY: ROTATION_ROWS}[decision]
             self.correct(residual[rows], H[rows], R[rows, rows])
         return decision if status == ON_MAP else decision | RELEASED
+
+    def _meet_gate(self, log: Columns, j: int) -> tuple[Array, Array, Array, int]:
+        """Return residual, Jacobian and covariance of measurement j, and what the gate lets through; write its NIS."""
+        residual, H, R = self._predict(log, j)
+        self.work.residual[:] = residual
+        if log.kinds[j] == OBJECT_POSE:
+            follow_scatter(self.m, int(log.objects[j]), log.translations[j], residual)
+        return residual, H, R, self.gate(residual, H @ self.m.P @ H.T + R, log.nis[j])
 
     def _predict(self, log: Columns, j: int) -> tuple[Array, Array, Array]:
         """Return residual, Jacobian and covariance of measurement j."""
@@ -207,8 +212,7 @@ class ReferenceFilter:
         return np.asarray(root[:, None] * log.covariances[j] * root)
 
     def _settle(self, log: Columns, j: int) -> int:
-        residual, H, R = self._predict(log, j)
-        decision = self.gate(residual, H @ self.m.P @ H.T + R, log.nis[j])
+        residual, H, R, decision = self._meet_gate(log, j)
         if decision != ACCEPTED:
             return REJECTED
         self.correct(0.0 * residual, H, R)
