@@ -21,8 +21,8 @@ LOWER_QUARTILE = 1.212_533
 """Of a chi-square of three degrees of freedom, in units of which a part's NIS is judged."""
 LEAST = 0.5
 """Innovations far smaller than expected count down to this factor, so that it takes many larger ones to widen noise."""
-HASTE, HASTE_OVER = 6.0, 24.0
-"""The first poses move the factors so many times faster, which fades over about so many."""
+FIRST_RATE, OVER = 1.2, 24.0
+"""The first poses move the factors at this rate, at half of it after so many."""
 
 # Places in a row of `Memory.scales`: factors of the 1-sigma of rotation and position, and how many poses were followed.
 TURN, PLACE, FOLLOWED = range(3)
@@ -37,7 +37,7 @@ def follow_scale(m: Memory, kind: int, k: int, nis: Array, rate: float, largest:
     if not math.isfinite(nis[0]):  # of an object whose pose is not known yet
         return
     scales = m.scales[0 if kind == OBJECT_POSE else 1]
-    gain = rate * max(1.0, HASTE / (1.0 + scales[FOLLOWED] / HASTE_OVER))
+    gain = max(rate, FIRST_RATE / (1.0 + scales[FOLLOWED] / OVER))
     for part in range(1 if kind == OBJECT_POSE and m.orders[k] == 0 else 0, 2):
         step = 0.125 if nis[1 + part] > LOWER_QUARTILE else -0.375
         scales[part] = min(max(scales[part] * math.exp(gain * step), LEAST), largest)

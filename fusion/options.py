@@ -100,10 +100,10 @@ class Gate:
     settled: float = 0.02
     """While the position is less sure than this 1-sigma per axis, m, what fits best at a stamp is taken in first, and
     the position of a grossly turned detection is refused: that of a flipped one is wrong too, and the gate is wide."""
-    adaptation: float = 0.2
+    adaptation: float = 0.06
     """How fast noise that is larger than stated widens what was stated (`fusion/noise_scale.py`): from a pose whose
     innovation is beyond the lower quartile of what was expected, the 1-sigma of all poses grows by an eighth of this,
-    from any other it falls by three eighths; 0: not at all."""
+    from any other it falls by three eighths (the first poses of all count more); 0: not at all."""
     max_noise_scale: float = 10.0
     """Largest factor of the 1-sigma that this may reach."""
 
