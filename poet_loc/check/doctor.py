@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+from poet_loc.check.covariances import check_covariances
 from poet_loc.check.finding import Finding
 from poet_loc.check.gravity import check_gravity
 from poet_loc.check.noise import check_noise
@@ -40,6 +41,7 @@ CHECKS: tuple[Check, ...] = (
     check_ground_truth,
     check_gravity,
     check_landmarks,
+    check_covariances,
     check_noise,
     check_odometry,
 )

@@ -101,7 +101,7 @@ def _misfits(log: Log) -> dict[str, dict[tuple[Reading, Reading], float]]:
     if log.landmark_map is None or len(log.landmark_map) < 2:
         return misfits
     for name, poses in log.object_poses.items():
-        pairs = _pairs(poses, log.landmark_map)
+        pairs = pairs_in_frames(poses, log.landmark_map)
         if len(pairs[0]) >= _LEAST_SEEN:
             readings = product(READINGS, READINGS)
             misfits[name] = {both: _misfit(poses, log.landmark_map, pairs, *both) for both in readings}
@@ -183,7 +183,7 @@ def check_ground_truth(log: Log) -> Iterator[Finding]:
     yield Finding("ground-truth-apart", "error", "T_world_cam.tum", what, fix, evidence)
 
 
-def _pairs(poses: ObjectPoses, landmark_map: LandmarkMap) -> tuple[Rows, Rows, Rows, Rows]:
+def pairs_in_frames(poses: ObjectPoses, landmark_map: LandmarkMap) -> tuple[Rows, Rows, Rows, Rows]:
     """Return rows i, j of detections in one frame, and the landmarks a, b that they are; only unsymmetric ones."""
     places = {each.key: index for index, each in enumerate(landmark_map) if each.symmetry is None}
     keys = zip(poses.object_ids.tolist(), poses.instances.tolist(), strict=True)

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
+from fusion.simulate import SimulationOptions, simulate
 from poet_loc.check.gravity import turned_world
 from poet_loc.check.pose_sources import Reading, reread
 from poet_loc.core.geometry import make_pose
@@ -183,6 +184,23 @@ def lengths(factor: float, *files: str) -> SpoilLog:
     return spoil
 
 
+def stated(times_too_small: float) -> SpoilLog:
+    """Let detections state so many times less than errors of 5 mm and 2 deg that they then have."""
+
+    def spoil(log: Log) -> Log:
+        poses, rng = log.object_poses[""], np.random.default_rng(8)
+        sigma = np.repeat([np.radians(2.0), 0.005], 3)
+        truth = simulate(SimulationOptions(duration_s=15.0, objects=5, symmetric_objects=1, seed=0, noise="none"))
+        exact = truth.object_poses[""]
+        error = sigma * rng.standard_normal((len(exact), 6))
+        turn, T_true = Rotation.from_rotvec(error[:, :3]), exact.T_cam_obj
+        T = make_pose(turn * T_true.rotation, T_true.translation + error[:, 3:])
+        covariances = np.tile(np.diag((sigma / times_too_small) ** 2), (len(exact), 1, 1))
+        return replace(log, object_poses={"": replace(exact, T_cam_obj=T, covariances=covariances)})
+
+    return spoil
+
+
 def moved_landmark(log: Log) -> Log:
     return with_landmark(log, 2, make_pose(Rotation.identity(), [0.2, -0.1, 0.05]))
 
@@ -328,6 +346,7 @@ SPOILED_LOGS: dict[str, tuple[SpoilLog, set[str], bool]] = {
     "detector with another scale": (lengths(2.54, "object_poses"), {"scale", "ground-truth-apart"}, False),
     "landmark moved": (moved_landmark, {"landmark-out-of-line"}, False),
     "landmark turned": (turned_landmark, {"landmark-out-of-line"}, False),
+    "covariances too small": (stated(2.5), {"covariance-too-small"}, False),
     "landmark missing": (missing_landmark, {"unknown-object"}, True),
     "noise far too small": (noise(gyroscope_noise_density=0.01), {"noise-too-small"}, False),
     "noise discrete": (noise(accelerometer_noise_density=14.1), {"noise-too-large"}, False),

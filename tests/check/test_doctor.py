@@ -14,11 +14,12 @@ from scipy.spatial.transform import Rotation
 
 sys.path.insert(0, str(Path(__file__).parent))
 
-from spoiled_logs import SPOILED_FILES, SPOILED_LOGS, imu, inverse_extrinsics, late_camera, write_spoiled
+from spoiled_logs import SPOILED_FILES, SPOILED_LOGS, imu, inverse_extrinsics, late_camera, stated, write_spoiled
 
 from fusion.odometry import expected_of
 from fusion.options import FuseOptions
 from fusion.simulate import SimulationOptions, simulate
+from poet_loc.check.covariances import check_covariances
 from poet_loc.check.doctor import diagnose, write_repaired
 from poet_loc.check.odometry import EXPECTED, breaks_of
 from poet_loc.cli.main import main
@@ -222,3 +223,11 @@ def test_each_set_of_detections_is_looked_at(reading, finding, good_log, tmp_pat
     assert all(file == "object_poses_wrong.csv" for _, file in found)
     write_repaired(diagnosis, tmp_path.parent / f"fixed_{reading}")
     assert not diagnose(tmp_path.parent / f"fixed_{reading}").findings
+
+
+@pytest.mark.parametrize("times", [2.5, 6.0])
+def test_covariances_that_are_too_small_are_told_by_how_much(times, good_log):
+    (finding,) = check_covariances(stated(times)(good_log))
+    assert finding.evidence["times_too_small"] == pytest.approx(times, rel=0.1)
+    for right in (1.0, 0.3):
+        assert not list(check_covariances(stated(right)(good_log)))
