@@ -40,7 +40,7 @@ def check_covariances(log: Log) -> Iterator[Finding]:
 def _stated(poses: ObjectPoses) -> ObjectPoses:
     if poses.covariances is None:
         return poses[:0]
-    return poses[np.isfinite(poses.covariances).all(axis=(1, 2))]
+    return poses[np.asarray(np.isfinite(poses.covariances).all(axis=(1, 2)))]
 
 
 def _disagreement(poses: ObjectPoses, landmark_map: LandmarkMap) -> Array:

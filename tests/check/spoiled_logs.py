@@ -188,7 +188,7 @@ def stated(times_too_small: float) -> SpoilLog:
     """Let detections state so many times less than errors of 5 mm and 2 deg that they then have."""
 
     def spoil(log: Log) -> Log:
-        poses, rng = log.object_poses[""], np.random.default_rng(8)
+        rng = np.random.default_rng(8)
         sigma = np.repeat([np.radians(2.0), 0.005], 3)
         truth = simulate(SimulationOptions(duration_s=15.0, objects=5, symmetric_objects=1, seed=0, noise="none"))
         exact = truth.object_poses[""]
