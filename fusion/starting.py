@@ -12,6 +12,7 @@ from fusion.ballot import (
     LONGEST_WINDOW_S,
     LOST_MIN_VOTES,
     LOST_SHARE,
+    LOST_SIGMA,
     LOST_WINDOW_S,
     MAX_TILT,
     MIN_OBJECTS,
@@ -45,7 +46,9 @@ from fusion.memory import (
     Work,
 )
 from fusion.nav_state import (
+    ACCEL_BIAS,
     AT_BIASES,
+    AT_OBJECTS,
     AT_TIME_OFFSET,
     BIASES,
     CORE,
@@ -235,7 +238,9 @@ def _is_contested(m: Memory, w: Work, first: int) -> bool:
 @njit(cache=True)
 def starts(m: Memory, w: Work) -> bool:
     """Start, or start again, where the votes up to now call for it; tell whether it did."""
-    return _starts_first(m, w) if m.counters[MODE] == INITIALISING else _starts_again(m, w)
+    if m.counters[MODE] == INITIALISING:
+        return _starts_first(m, w)
+    return _starts_adrift(m, w) or _starts_again(m, w)
 
 
 @njit(cache=True)
@@ -281,6 +286,24 @@ def _found_by_votes(m: Memory, w: Work) -> bool:
     at_once = (objects >= m.start[MIN_OBJECTS] or alike > 1) and m.layout[AT_TIME_OFFSET] < 0
     settled = span >= m.start[START_MIN_SPAN_S] or at_once
     return settled and not _is_contested(m, w, first)
+
+
+@njit(cache=True)
+def _starts_adrift(m: Memory, w: Work) -> bool:
+    """Start as at first where the state, unsure of its place, has refused all of late; tell whether it did.
+
+    Its attitude has no say, and what led it astray is in its biases, too.
+    """
+    unsure = max(m.P[3, 3], m.P[4, 4], m.P[5, 5]) > m.start[LOST_SIGMA] ** 2
+    if not unsure or m.layout[AT_OBJECTS] >= 0 or m.counters[UNHELD_ROW] < m.start[FEW_VOTES]:
+        return False
+    m.up[:] = 0.0
+    if not _found_by_votes(m, w):
+        return False
+    for i in range(3):
+        m.x[ACCEL_BIAS + i] = 0.0
+    start_again(m, w, 0)
+    return True
 
 
 @njit(cache=True)
