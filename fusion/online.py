@@ -147,6 +147,9 @@ class Estimator:
         if self.options.estimator != self._estimator or self.options.smooth:
             what = f"{type(self).__name__} is no {'smoother' if self.options.smooth else self.options.estimator}"
             raise InputError(what, fix="Estimator is the filter (eskf), GraphEstimator the fixed-lag graph (graph)")
+        if self.options.camera_noise.correlation_s > 0.0:
+            fix = "feed covariances that are so much wider (docs/why_is_my_filter_wrong.md)"
+            raise InputError("camera-noise.correlation-s is of whole logs, whose rate is known", fix=fix)
         problem = empty_problem(calibration, landmark_map, self.options, layout)
         self.layout, self.keys = problem.layout, problem.keys
         self._floats, self._integers = fill_memory(problem, self.options)

@@ -37,6 +37,7 @@ RANGES: dict[str, tuple[str, ...]] = {
     ),
     "[0, inf)": (
         "camera_noise.solver_correlation_s",
+        "camera_noise.correlation_s",
         "noise.across",
         "noise.along",
         "noise.floor",

@@ -40,6 +40,8 @@ class CameraNoise:
     solver_correlation_s: float = 2.4
     """The errors of the solver's own poses last so long, s. A filter that takes them for white believes itself too
     much, so their 1-sigma is larger by about the square root of twice that time in poses: by 12 at 30 Hz. 0: white."""
+    correlation_s: float = 0.0
+    """The same of the log's own camera poses (of a relocaliser, PnP, another SLAM), s; online, feed wider ones."""
 
 
 @dataclass(frozen=True)

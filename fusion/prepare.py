@@ -82,7 +82,8 @@ def pose_problem(
         poses = camera_poses if camera_poses is not None else log.camera_poses
         if poses is None:
             raise InputError("there are no camera poses to fuse", path=log.path, fix="localize first, or fuse objects")
-        lasting_s = 0.0 if camera_poses is None else options.camera_noise.solver_correlation_s
+        noise = options.camera_noise
+        lasting_s = noise.correlation_s if camera_poses is None else noise.solver_correlation_s
         measured = camera_measurements(poses, calibration, options, lasting_s)
     else:
         if log.landmark_map is None:

@@ -2,13 +2,22 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.linalg import toeplitz
-from scipy.spatial.transform import RigidTransform
+from scipy.spatial.transform import RigidTransform, Rotation
 
-from fusion.options import FuseOptions
+from fusion.detection_errors import gauss_markov
+from fusion.fuse import fuse
+from fusion.online import Estimator
+from fusion.options import CameraNoise, FuseOptions
 from fusion.prepare import camera_measurements
+from fusion.simulate import SimulationOptions, simulate
+from poet_loc.core.consistency import pose_nees
+from poet_loc.core.geometry import make_pose
+from poet_loc.core.input_error import InputError
 from poet_loc.core.records import Calibration, CameraPoses
 
 
@@ -37,3 +46,28 @@ def test_white_ones_and_repeated_stamps_stay_as_they_are():
     assert np.isfinite(lasting).all()
     one = camera_measurements(poses(stamps[:1]), Calibration(), FuseOptions(), 2.4)
     np.testing.assert_array_equal(one.covariances, poses(stamps[:1]).covariances)
+
+
+def test_camera_poses_of_the_logs_own_whose_errors_last():
+    options, lasting_s, found = FuseOptions(measurements="camera"), 2.0, {0.0: [], 2.0: []}
+    for seed in range(3):
+        log = simulate(SimulationOptions(duration_s=30.0, imu_rate_hz=100.0, camera_poses=True, seed=seed))
+        given, rng = log.camera_poses, np.random.default_rng(seed)
+        sigma = np.repeat([np.radians(1.0), 0.02], 3)
+        error = sigma * gauss_markov(len(given.stamps_ns), (6,), 1.0 / 30.0 / lasting_s, rng)
+        true, _ = log.T_world_cam.interpolate(given.stamps_ns)
+        T = make_pose(true.rotation * Rotation.from_rotvec(error[:, :3]), true.translation + error[:, 3:])
+        log = replace(log, camera_poses=replace(given, T_world_cam=T))
+        for said_s, nees in found.items():
+            result = fuse(log, replace(options, camera_noise=CameraNoise(correlation_s=said_s)))
+            truth, known = log.T_world_imu.interpolate(result.stamps_ns)
+            nees.append(pose_nees(result.T_world_imu[known], truth[known], result.pose_covariances[known]).mean())
+    assert np.mean(found[0.0]) > 8.0
+    assert np.mean(found[2.0]) < 2.0
+
+
+def test_online_tells_that_it_does_not_know_the_rate():
+    log = simulate(SimulationOptions(duration_s=1.0, camera_poses=True))
+    options = FuseOptions(measurements="camera", camera_noise=CameraNoise(correlation_s=2.0))
+    with pytest.raises(InputError, match="whole logs"):
+        Estimator(log.calibration, None, options)
