@@ -94,6 +94,12 @@ def _objects(ballot: Ballot, correction: Correction, what: int) -> int:
 
 
 @njit(cache=True)
+def feels_gravity(ballot: Ballot) -> bool:
+    """Tell whether the votes are told where up is; places alone say nothing without it."""
+    return ballot.up[0] != 0.0 or ballot.up[1] != 0.0 or ballot.up[2] != 0.0
+
+
+@njit(cache=True)
 def objects_seen(ballot: Ballot) -> int:
     """Return how many objects cast the votes."""
     seen, count = 0, 0

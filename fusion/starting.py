@@ -25,7 +25,7 @@ from fusion.ballot import (
     agreed_correction,
 )
 from fusion.compiled import njit
-from fusion.consensus import has_rival, largest_agreement, objects_seen
+from fusion.consensus import feels_gravity, has_rival, largest_agreement, objects_seen
 from fusion.eskf import POSITION_ONLY
 from fusion.measurements import OBJECT_POSE
 from fusion.meeting import forget_rivals
@@ -277,7 +277,8 @@ def _found_by_votes(m: Memory, w: Work) -> bool:
     total = m.counters[VOTE_HEAD] - first
     needed = m.start[FEW_VOTES] if span >= m.start[FEW_SPAN_S] else m.start[MIN_VOTES]
     if count < max(needed, m.start[MIN_SHARE] * total):
-        if objects_seen(_ballot(m, w, first)) < m.start[MIN_OBJECTS] or m.start[MAX_TILT] >= math.pi:
+        ballot = _ballot(m, w, first)
+        if objects_seen(ballot) < m.start[MIN_OBJECTS] or not feels_gravity(ballot):
             return False
         count, span, objects, alike = _agreement(m, w, first, True)
         if objects < m.start[MIN_OBJECTS] or count < max(m.start[MIN_VOTES], m.start[MIN_PLACES] * total):

@@ -105,6 +105,17 @@ def test_a_filter_that_sees_nothing_goes_on():
     assert np.diff(gap).max() < 20_000_000
 
 
+def test_three_objects_beside_an_imu_that_is_all_wrong_start_by_whole_votes_alone():
+    """Where gravity has no say, places alone would leave the turn about the line between two objects open."""
+    world = {"duration_s": 8.0, "imu_rate_hz": 100.0, "objects": 4, "symmetric_objects": 0}
+    log = simulate(SimulationOptions(seed=2, **world))
+    rates = np.random.default_rng(0).normal([1.2, -0.8, 0.4], 0.05, (len(log.imu), 3))
+    log = replace(log, imu=replace(log.imu, angular_velocity=rates))
+    result = fuse(log)
+    assert result.restarts > 0
+    assert np.isfinite(result.T_world_imu.translation).all()
+
+
 @pytest.mark.parametrize("odometry", [True, False])
 def test_compiled_is_plain_where_the_filter_is_led_astray(odometry):
     options = FuseOptions()
