@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from fusion.columns import Columns
 from fusion.compiled import njit
+from fusion.lasting_share import bias_scale
 from fusion.measurements import OBJECT_POSE, viewing_axes
 from fusion.memory import Memory
 from fusion.nav_state import N_BIAS_KINDS, SPREAD_COUNT, SPREAD_SIZE, SPREADS
@@ -88,7 +89,8 @@ def _follow_spread(m: Memory, k: int, R: Array, t: Array) -> None:
     along /= squared
     across = 0.5 * (R[3, 3] + R[4, 4] + R[5, 5] - along)
     floor = model[WHITE_FLOOR] ** 2
-    turning, placing = scale_of(m, OBJECT_POSE, TURN) ** 2, scale_of(m, OBJECT_POSE, PLACE) ** 2
+    turning = (bias_scale(m) * scale_of(m, OBJECT_POSE, TURN)) ** 2
+    placing = (bias_scale(m) * scale_of(m, OBJECT_POSE, PLACE)) ** 2
     x[at + SPREAD_COUNT] = min(x[at + SPREAD_COUNT] + 1.0, model[MEAN_OVER])
     gain = 0.5 / x[at + SPREAD_COUNT]
     turned = turning * (R[0, 0] + R[1, 1] + R[2, 2])

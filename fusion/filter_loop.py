@@ -25,6 +25,7 @@ from fusion.filter_update import (
     settle,
     take,
 )
+from fusion.lasting_share import follow_pairs
 from fusion.measurements import OBJECT_POSE, ODOMETRY_STEP
 from fusion.meeting import PUT, START_AGAIN, UNKNOWN_MAP, choose_anchor, forget_rivals, suppose
 from fusion.memory import (
@@ -280,6 +281,7 @@ def account(m: Memory, w: Work, log: Columns, first: int, last: int) -> None:
                 follow_scale(m, kind, k, log.nis[j], m.limits[ADAPTATION], m.limits[MAX_SCALE])
     if c[MODE] != TRACKING:
         return
+    follow_pairs(m, w, log, first, last)
     if c[UNHELD_ROW] == 0:
         c[UNHELD_SINCE] = c[NOW]
     c[UNHELD_ROW] = 0 if held else c[UNHELD_ROW] + last - first

@@ -8,9 +8,10 @@ from fusion.columns import Columns, read, read_fitted
 from fusion.compiled import njit
 from fusion.eskf import ACCEPTED, POSITION_ONLY, REJECTED, ROTATION_ONLY, correct, gate, innovation
 from fusion.imu import GUESSED
+from fusion.lasting_share import MET
 from fusion.measurements import OBJECT_POSE, object_in_world, residual_and_jacobian
 from fusion.meeting import UNKNOWN_MAP
-from fusion.memory import MODE, TRACKING, Memory, Work
+from fusion.memory import MODE, NOW, TRACKING, Memory, Work
 from fusion.nav_state import N_BIAS_KINDS, N_OBJECTS, OBJECT_SIZE, OBJECTS, TIME_OFFSET, Array
 from fusion.new_states import adopt_object
 from fusion.object_biases import forget_bias
@@ -128,7 +129,7 @@ def put_object(m: Memory, w: Work, log: Columns, j: int) -> None:
     forget_biases(m, k, False)
     count = _predict(m, w, OBJECT_POSE, k)
     adopt_object(m, w, k, count)
-    m.known[k] = 1.0
+    m.known[k], m.pairs[k, MET] = 1.0, m.counters[NOW]
     if len(m.tape) > 0:
         note_meeting(m, w, k, count)
 

@@ -49,6 +49,7 @@ INITIALISING, TRACKING = 0, 1
 TALLY_SIZE, PLACE_SIZE = 8, 15  # rows of tallies and places, see place_watch.py
 SCATTER_SIZE = 11  # see scatter.py
 SCALE_SIZE = 3  # see noise_scale.py
+PAIR_SIZE = 9  # see lasting_share.py
 SUPPOSED, SUPPOSED_SIZE = 6, 16  # hypotheses of each unknown object's pose, see meeting.py
 
 # Integer header: where things stand in the float buffer, sizes.
@@ -62,6 +63,7 @@ SUPPOSED, SUPPOSED_SIZE = 6, 16  # hypotheses of each unknown object's pose, see
     AT_PLACES,
     AT_SUPPOSED,
     AT_SCATTER,
+    AT_PAIRS,
     AT_UP,
     END_OF_STATE,
     AT_NOISE,
@@ -90,7 +92,7 @@ SUPPOSED, SUPPOSED_SIZE = 6, 16  # hypotheses of each unknown object's pose, see
     AT_TAPE,
     TAPE_SIZE,
     HEADER,
-) = range(37)
+) = range(38)
 
 
 class Memory(NamedTuple):
@@ -105,6 +107,7 @@ class Memory(NamedTuple):
     places: Array  # (K, .) where each object stands against the map: places in place_watch.py
     supposed: Array  # (K, SUPPOSED, .) where an object of unknown pose may be: places in meeting.py; or (0, ..)
     scatter: Array  # (K, .) how much each object's detections differ from one to the next: places in scatter.py
+    pairs: Array  # (K + 1, .) how each object's detections disagree with its neighbour's: places in lasting_share.py
     up: Array  # (3,) running mean of the specific force in the axes of the integrated motion
     noise: Array  # of the motion: places in imu.py and odometry.py
     limits: Array  # places: filter_update.LIMIT_BOTH and following
@@ -143,6 +146,7 @@ def allocate(layout: StateLayout) -> tuple[Array, Ints]:
         (AT_PLACES, PLACE_SIZE * max(K, 1)),
         (AT_SUPPOSED, SUPPOSED * SUPPOSED_SIZE * header[H_SUPPOSED]),
         (AT_SCATTER, SCATTER_SIZE * max(K, 1)),
+        (AT_PAIRS, PAIR_SIZE * (max(K, 1) + 1)),
         (AT_UP, 3),
         (END_OF_STATE, 0),
         (AT_NOISE, 12),
@@ -207,6 +211,7 @@ def views(floats: Array, integers: Ints) -> Memory:
         f[i[AT_PLACES] : i[AT_PLACES] + PLACE_SIZE * K].reshape((K, PLACE_SIZE)),
         f[i[AT_SUPPOSED] : i[AT_SCATTER]].reshape((i[H_SUPPOSED], SUPPOSED, SUPPOSED_SIZE)),
         f[i[AT_SCATTER] : i[AT_SCATTER] + SCATTER_SIZE * K].reshape((K, SCATTER_SIZE)),
+        f[i[AT_PAIRS] : i[AT_PAIRS] + PAIR_SIZE * (K + 1)].reshape((K + 1, PAIR_SIZE)),
         f[i[AT_UP] : i[AT_UP] + 3],
         f[i[AT_NOISE] : i[AT_NOISE] + 12],
         f[i[AT_LIMITS] : i[AT_LIMITS] + 12],

@@ -108,6 +108,7 @@ RANGES: dict[str, tuple[str, ...]] = {
         "start.lost_min_votes",
         "graph.max_iterations",
     ),
+    "[0, 2)": ("bias.white_below",),
     "(0, 1]": ("gate.probability",),
     "[0, 1]": ("start.min_share", "start.min_places", "start.lost_share"),
 }

@@ -87,6 +87,10 @@ class DetectionBias:
     """An object refused so often in a row has another bias: the old one is forgotten."""
     jump: float = 5.0
     """The new one's 1-sigma, in units of the varying bias's."""
+    white_below: float = 1.07
+    """Where two objects' detections disagree with the map by no more than so many times what this changes by from frame
+    to frame (variances), nothing lasts of their errors, and next to no biases are looked for; from twice as much on
+    biases are as large as said here, between in proportion (`fusion/lasting_share.py`); 0: always as said here."""
     gross: float = 5.0
     """A varying bias beyond so many sigma is a gross error in a run: it does not fade, it jumps."""
 

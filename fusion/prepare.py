@@ -16,6 +16,7 @@ from fusion import ballot, filter_update, imu, meeting, memory, object_biases, o
 from fusion.bias_spread import spread_model, white_part
 from fusion.imu_noise import imu_rows
 from fusion.known_errors import known_errors
+from fusion.lasting_share import begin_pairs
 from fusion.measurements import CAMERA_POSE, OBJECT_POSE, Measurements, ray_aligned_covariance
 from fusion.motion_source import Kind, motion_source, odometry_steps
 from fusion.nav_state import ACCEL_BIAS_ERROR, CORE, GYRO_BIAS_ERROR, VELOCITY_ERROR, StateLayout, nominal_state
@@ -252,6 +253,7 @@ def fill_memory(problem: Problem, options: FuseOptions) -> tuple[Array, NDArray[
                 m.axes[k] = landmark.symmetry.axis
                 m.orders[k] = 0 if landmark.symmetry.order == "continuous" else landmark.symmetry.order
     m.scales[:, :FOLLOWED] = 1.0
+    begin_pairs(m, options.bias.white_below)
     return floats, integers
 
 

@@ -17,6 +17,7 @@ from fusion.bias_spread import follow_spreads
 from fusion.columns import OUT_CORE, OUT_SIGMA, Columns, Rows
 from fusion.eskf import ACCEPTED, POSITION_ONLY, REJECTED, ROTATION_ONLY
 from fusion.fuse import run_filter
+from fusion.lasting_share import MET
 from fusion.measurements import OBJECT_POSE, ODOMETRY_STEP
 from fusion.meeting import PUT, UNKNOWN_MAP, choose_anchor
 from fusion.nav_state import (
@@ -253,7 +254,7 @@ class ReferenceFilter:
         A, Q = np.eye(layout.n_error), np.zeros_like(m.P)
         A[rows], Q[rows, rows] = -inverse @ H, inverse @ R @ inverse.T
         self.spread(A, Q)
-        m.known[k] = 1.0
+        m.known[k], m.pairs[k, MET] = 1.0, m.counters[memory.NOW]
 
     def _fit_symmetry(self, k: int, R_m: Array, R: Array) -> tuple[Array, Array]:
         """Turn a measured rotation to the look-alike that fits best; a continuous symmetry says nothing of its turn."""

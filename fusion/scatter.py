@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fusion.compiled import njit
+from fusion.lasting_share import bias_scale
 from fusion.memory import NOW, Memory
 from fusion.nav_state import SPREAD_SIZE, SPREADS
 from fusion.options import DetectionBias
@@ -78,7 +79,9 @@ def spread_by_scatter(m: Memory, k: int) -> None:
     """Let the biases of object k spread as its detections so far say."""
     for i in range(3):
         if m.usual_scatter[i] > 0.0:
-            m.x[m.layout[SPREADS] + SPREAD_SIZE * k + i] = math.sqrt(m.scatter[k, SIGMAS + i] / m.usual_scatter[i])
+            m.x[m.layout[SPREADS] + SPREAD_SIZE * k + i] = bias_scale(m) * math.sqrt(
+                m.scatter[k, SIGMAS + i] / m.usual_scatter[i]
+            )
 
 
 @njit(cache=True)

@@ -14,6 +14,7 @@ from fusion import filter_loop, memory, reference_filter
 from fusion.bias_spread import follow_spreads, spread_model, white_part
 from fusion.columns import Columns
 from fusion.fuse import fuse
+from fusion.lasting_share import begin_pairs
 from fusion.measurements import OBJECT_POSE, ray_aligned_covariance, viewing_axes
 from fusion.nav_state import StateLayout, nominal_state
 from fusion.options import DetectionBias, DetectionNoise, FuseOptions
@@ -29,6 +30,7 @@ def factors_after(covariances: np.ndarray, t: np.ndarray, k: int = 1) -> np.ndar
     """Return the three factors of object k after detections with this white noise."""
     m, count = memory.views.py_func(*memory.allocate(LAYOUT)), len(covariances)
     m.x[:], m.spread_model[:] = nominal_state(LAYOUT), spread_model(NOISE)
+    begin_pairs(m, BIAS.white_below)
     ints, kinds = np.zeros(count, dtype=np.int64), np.full(count, OBJECT_POSE)
     motion = np.zeros(0, dtype=np.int64), np.zeros((0, 9))
     places = np.tile(t, (count, 1))
