@@ -16,6 +16,7 @@ from fusion.imu import (
 )
 from fusion.memory import (
     BIAS_TIME,
+    FIRST_VOTE,
     IMU_AT,
     INITIALISING,
     LAST_STAMP,
@@ -25,6 +26,7 @@ from fusion.memory import (
     TRACKING,
     UNHELD_ROW,
     UNHELD_SINCE,
+    UNSURE_AT,
     UP_COUNT,
     VOTE_HEAD,
     Memory,
@@ -33,6 +35,8 @@ from fusion.memory import (
 from fusion.nav_state import ACCEL_BIAS, AT_CLONE, AT_GRAVITY, AT_OBJECTS, GRAVITY, GYRO_BIAS, POSITION, Array, Ints
 from fusion.odometry import IS_ODOMETRY, move_by_odometry, spread_by_odometry
 from fusion.tape import note_odometry, note_step
+
+_NEVER = -(2**63)
 
 
 @njit(cache=True)
@@ -53,7 +57,7 @@ def begin(m: Memory, stamp: int, specific_force: Array, imu_index: int) -> None:
     m.up[0], m.up[1], m.up[2] = 0.0, 0.0, 1.0
     c = m.counters
     c[NOW], c[IMU_AT], c[MODE], c[BIAS_TIME], c[UP_COUNT] = stamp, imu_index, INITIALISING, stamp, 0
-    c[LAST_STAMP] = stamp - 1
+    c[LAST_STAMP], c[UNSURE_AT], c[FIRST_VOTE] = stamp - 1, _NEVER, c[VOTE_HEAD]
 
 
 @njit(cache=True)
@@ -88,7 +92,7 @@ def give_up_where_lost(m: Memory, specific_force: Array) -> None:
     if m.counters[MODE] == TRACKING and (_looks_anywhere(m) or _is_shut_out(m)):
         last = m.counters[LAST_STAMP]
         begin(m, m.counters[NOW], specific_force, m.counters[IMU_AT])
-        m.counters[LAST_STAMP], m.counters[VOTE_HEAD] = last, 0
+        m.counters[LAST_STAMP] = last
         m.counters[RESTARTS] += 1
         for i in range(3):
             m.x[ACCEL_BIAS + i] = 0.0

@@ -209,8 +209,8 @@ class GraphEstimator(Estimator):
     def _keep(self) -> None:
         """Keep filter and graph as they are, and drop what no late pose can ask for."""
         walk, now = self._walk, int(self.memory.counters[memory.NOW])
-        floats, integers = walk.floats[: len(self._first_state)].copy(), walk.integers.copy()
-        kept = _Kept(now, floats, integers, walk.cursor.copy(), walk.fresh.copy(), walk.first, self._newest)
+        whole = walk.floats.copy(), walk.integers.copy()  # with the votes and what was used of them
+        kept = _Kept(now, *whole, walk.cursor.copy(), walk.fresh.copy(), walk.first, self._newest)
         self._kept.append(kept)
         while len(self._kept) > 1 and self._kept[1].now <= now - self._lag_ns:
             self._kept.popleft()
@@ -220,8 +220,8 @@ class GraphEstimator(Estimator):
         while self._kept[-1].now >= before_ns:
             self._kept.pop()
         kept, walk = self._kept[-1], self._walk
-        walk.floats[: len(kept.floats)] = kept.floats
-        walk.integers[:], walk.cursor[:], walk.fresh[:] = kept.integers, kept.cursor, kept.fresh
+        walk.floats[:], walk.integers[:] = kept.floats, kept.integers
+        walk.cursor[:], walk.fresh[:] = kept.cursor, kept.fresh
         walk.first = kept.first
         if kept.smoother is not self._newest:  # keyframes are undone
             self._newest = kept.smoother

@@ -42,8 +42,9 @@ VOTES = 256  # a second of eight objects at 30 Hz; a power of two, so that place
     REFUSED_ODOMETRY,  # how often in a row odometry's way was refused, its turn not
     UNHELD_ROW,  # how many poses in a row were refused, or let in by a gross error's bias alone
     UNHELD_SINCE,  # the stamp of the first of these
+    FIRST_VOTE,  # cast since the motion began anew: none from before count
     N_COUNTERS,
-) = range(23)
+) = range(24)
 INITIALISING, TRACKING = 0, 1
 
 TALLY_SIZE, PLACE_SIZE = 8, 15  # rows of tallies and places, see place_watch.py

@@ -32,6 +32,7 @@ from fusion.meeting import forget_rivals
 from fusion.memory import (
     BIAS_TIME,
     CLONED,
+    FIRST_VOTE,
     INITIALISING,
     LAST_UPDATE,
     MODE,
@@ -174,11 +175,11 @@ def _write_variances(m: Memory, k: int, p_co: Array, covariance: Array, vote: Ar
 def first_vote(m: Memory, window_s: float, wanted: int) -> int:
     """Return where the votes of the window start; a window with fewer than wanted votes reaches further back.
 
-    None reaches back to before the state lost its attitude.
+    None reaches back to before the motion began or the state lost its attitude.
     """
     head, capacity = m.counters[VOTE_HEAD], len(m.vote_stamps)
     first = head
-    while first > 0 and head - first < capacity - 1:
+    while first > m.counters[FIRST_VOTE] and head - first < capacity - 1:
         cast_at = m.vote_stamps[(first - 1) & (capacity - 1)]
         age = (m.counters[NOW] - cast_at) * 1e-9
         if cast_at < m.counters[UNSURE_AT]:

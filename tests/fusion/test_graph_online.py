@@ -12,7 +12,7 @@ from test_online import stated_for
 
 from fusion.graph import run_graph
 from fusion.graph_online import GraphEstimator
-from fusion.measurements import Measurements
+from fusion.measurements import CAMERA_POSE, Measurements
 from fusion.online_input import OnlineOptions
 from fusion.options import DetectionBias, Estimate, FuseOptions, Graph
 from fusion.prepare import time_shift_ns
@@ -37,6 +37,9 @@ class Feed:
         m = self.problem.measurements
         stamp = int(m.stamps_ns[j]) - time_shift_ns(self.problem.calibration)
         q = Rotation.from_matrix(m.rotations[j].reshape(3, 3)).as_quat()
+        if m.kinds[j] == CAMERA_POSE:
+            self.estimator.feed_camera_pose(stamp, m.translations[j], q, m.covariances[j])
+            return
         t = m.translations[j : j + 1]
         columns = t, q[None], stated_for(m.covariances[j : j + 1], t, self.estimator.options)
         object_id, instance = self.problem.keys[m.objects[j]]
@@ -169,3 +172,21 @@ def test_an_unknown_map_is_found_as_on_the_whole_log(lateness_s):
     assert lateness_s == 0.0 or feed.estimator.health().replays > 50
     assert_same_state(states[last], whole, 1e-8)
     np.testing.assert_array_equal(feed.estimator.memory.known, 1.0)
+
+
+@pytest.mark.parametrize("rate_hz", [15.0, 100.0])
+def test_a_restart_undone_by_late_poses_leaves_no_trace(rate_hz):
+    """Camera poses that jump make the filter start anew; they come late, in shreds and in the wrong order."""
+    options = FuseOptions(estimator="graph", measurements="camera")
+    options = replace(options, start=replace(options.start, lost_window_s=0.8, lost_min_votes=6))
+    problem = simulated("camera", duration_s=8.0, seed=1, camera_rate_hz=rate_hz)
+    m = problem.measurements
+    later = np.arange(len(m))[:, None] >= len(m) // 2
+    m = replace(m, translations=m.translations + later * [1.0, 0.5, 0.0])
+    problem = replace(problem, measurements=m)
+    whole = run_graph(problem, options)
+    assert whole.restarts == 1
+    fed = Feed(problem, options)
+    fed.all(np.random.default_rng(1).uniform(0.0, 1.5e9, len(m)))
+    assert fed.estimator.health().restarts == 1
+    assert_same_state(fed.estimator.state(), whole, 1e-3)

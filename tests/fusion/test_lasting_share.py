@@ -99,8 +99,8 @@ def test_the_disagreement_is_that_of_the_poses(seed):
 
 @pytest.mark.parametrize("share", [0.0, 0.25, 0.5])
 def test_the_ratio_says_which_share_lasts(share):
-    """Over many logs of 20 s: E|e|^2 is 1 / (1 - share) times half of what e changes by, and so are geometric means."""
-    found = [followed(lasting(share, 600, seed=seed), [0, 1]).pairs[-1, [LOG_TURN, LOG_PLACE]] for seed in range(24)]
+    """Over logs of 13 s: E|e|^2 is 1 / (1 - share) times half of what e changes by, and so are geometric means."""
+    found = [followed(lasting(share, 400, seed=seed), [0, 1]).pairs[-1, [LOG_TURN, LOG_PLACE]] for seed in range(8)]
     spread = np.std(found) / np.sqrt(len(found))
     # A chi-square's logarithm bends: what lasts is nearly constant in a log, and weighs as its mean logarithm.
     assert np.mean(found) == pytest.approx(-np.log(1.0 - share), abs=3.0 * spread + 0.25 * share)
@@ -180,11 +180,11 @@ def errors_of(log, options: FuseOptions) -> tuple[float, float]:
 
 
 @pytest.mark.parametrize("map_", ["known", "unknown"])
-@pytest.mark.parametrize("objects", [2, 4, 8])
+@pytest.mark.parametrize("objects", [2, 8])
 def test_default_options_are_right_about_white_errors(map_, objects):
     options = FuseOptions(estimate=Estimate(map=map_))
     believed = replace(options, bias=replace(options.bias, white_below=0.0))
-    logs = [white_log(seed, objects) for seed in range(6)]
+    logs = [white_log(seed, objects) for seed in range(4)]
     found, before = ([errors_of(log, each) for log in logs] for each in (options, believed))
     assert 0.8 <= np.mean([nees for _, nees in found]) <= 1.25
     assert np.mean([nees for _, nees in before]) < 0.65

@@ -61,6 +61,13 @@ def test_stamps_in_another_unit_are_refused(kind, unit_ns, log):
 
 
 @BOTH
+def test_stamps_may_be_counted_from_after_the_beginning(kind, log):
+    shift, estimator = -int(log.imu.stamps_ns[-1]), new(kind, log)
+    replay(estimator, log, stamp=lambda ns: ns + shift)
+    assert error_m(estimator, log, shift) < 0.1
+
+
+@BOTH
 def test_a_clock_that_is_set_back_begins_anew(kind, log):
     estimator = new(kind, log)
     replay(estimator, log, until_s=4.0)

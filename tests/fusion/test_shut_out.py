@@ -8,10 +8,11 @@ import numpy as np
 import pytest
 from filter_runs import assert_same, run
 from scipy.spatial.transform import Rotation
-from test_online import assert_ends_like, estimator_for, feed, shuffled
+from test_online import assert_ends_like, estimator_for, events, feed, shuffled
 
 from fusion import filter_loop, memory, reference_filter
 from fusion.fuse import fuse
+from fusion.online_input import OnlineOptions
 from fusion.options import FuseOptions
 from fusion.prepare import pose_problem
 from fusion.result import FuseResult
@@ -156,3 +157,29 @@ def test_on_real_logs_nothing_runs_away(shared_data, estimator):
         window = replace(log, imu=imu, T_odom_cam=odometry, object_poses={"": poses})
         _, position = errors(fuse(window, FuseOptions(estimator=estimator, motion=motion)), window)
         assert np.sqrt(np.mean(position**2)) < least
+
+
+def test_a_pose_from_before_the_filter_gave_up_may_come_after_many_votes_since():
+    """Votes of the time after it must not stand in the place of those from before it."""
+    log = led_astray(7, 30.0, odometry=False)
+    poses, rng = log.object_poses[""], np.random.default_rng(7)
+    seconds = (poses.stamps_ns - log.imu.stamps_ns[0]) * 1e-9
+    poses = poses[(seconds > 7.5) | (poses.frames % 2 == 0)]
+    seconds = (poses.stamps_ns - log.imu.stamps_ns[0]) * 1e-9
+    nonsense = ((seconds > ASTRAY_UNTIL_S) & (seconds < 7.5))[:, None]
+    T = poses.T_cam_obj
+    T = make_pose(
+        Rotation.from_rotvec(nonsense * rng.normal(size=(len(poses), 3))) * T.rotation,
+        T.translation + nonsense * rng.normal(size=(len(poses), 3)),
+    )
+    options = FuseOptions()
+    problem = pose_problem(replace(log, object_poses={"": replace(poses, T_cam_obj=T)}), options)
+    whole = run(filter_loop.run_log, problem, options)
+    gave_up, again = whole.stamps[np.argmax(np.diff(whole.stamps) > 30_000_000) + np.arange(2)]
+    frames = np.unique(problem.measurements.stamps_ns)
+    late, arrives = int(frames[frames < gave_up][-1]), int(again) + 2_500_000_000
+    estimator = estimator_for(problem, options, OnlineOptions(horizon_s=6.0))
+    for event in sorted(events(problem), key=lambda each: arrives if each[:2] == (late, 0) else each[0]):
+        feed(estimator, problem, event)
+    assert estimator.memory.counters[memory.RESTARTS] == whole.memory.counters[memory.RESTARTS] == 1
+    assert_ends_like(estimator, problem, options)
