@@ -160,11 +160,11 @@ class GraphEstimator(Estimator):
             self._too_late += 1
             return False
         at = int(np.searchsorted(room.stamps[:n], stamp))
-        while at < n and room.stamps[at] == stamp and room.objects[at] < k:
+        while at < n and room.stamps[at] == stamp and room.objects[at] <= k:
+            if self._is_at(at, kind, k, R_m, t_m):
+                self._duplicates += 1
+                return False
             at += 1
-        if at < n and room.stamps[at] == stamp and room.objects[at] == k and room.kinds[at] == kind:
-            self._duplicates += 1
-            return False
         if n == len(room.stamps):
             self._trim()
             at, n = at - (n - self._poses), self._poses
@@ -179,6 +179,12 @@ class GraphEstimator(Estimator):
         self._poses += 1
         return True
 
+    def _is_at(self, at: int, kind: int, k: int, R_m: Array, t_m: Array) -> bool:
+        """Tell whether the pose at a place is this one; a landmark may be seen twice at a stamp."""
+        room = self._room
+        same = room.kinds[at] == kind and room.objects[at] == k
+        return same and np.array_equal(room.rotations[at], R_m) and np.array_equal(room.translations[at], t_m)
+
     def _run(self) -> None:
         """Do all that can be done with what has come."""
         if self._samples == 0:
@@ -189,7 +195,7 @@ class GraphEstimator(Estimator):
         walk.fitted = Fitted(*(column[:m] for column in self._fitted))
         if not walk.begun:
             walk.begin()
-            self._keep()
+            self._keep(taken_in=False)
         walk.cursor[ROWS] = 0
         while (keyframe := walk.next_keyframe(to_the_end=False)) is not None:
             chain = replace(self._chain, stamps_ns=room.imu_stamps[:n], values=room.imu_values[:n])
@@ -206,9 +212,12 @@ class GraphEstimator(Estimator):
         if self.memory.counters[memory.NOW] - self._kept[-1].now >= self._snapshot_ns:
             self._keep()
 
-    def _keep(self) -> None:
-        """Keep filter and graph as they are, and drop what no late pose can ask for."""
-        walk, now = self._walk, int(self.memory.counters[memory.NOW])
+    def _keep(self, taken_in: bool = True) -> None:
+        """Keep filter and graph as they are, and drop what no late pose can ask for.
+
+        taken_in: a pose at this very stamp would come late.
+        """
+        walk, now = self._walk, int(self.memory.counters[memory.NOW]) - (not taken_in)
         whole = walk.floats.copy(), walk.integers.copy()  # with the votes and what was used of them
         kept = _Kept(now, *whole, walk.cursor.copy(), walk.fresh.copy(), walk.first, self._newest)
         self._kept.append(kept)

@@ -193,3 +193,17 @@ def test_a_copy_of_a_filter_goes_on_by_itself(again, log):
 def test_a_copy_of_a_graph_is_refused(log):
     with pytest.raises(TypeError, match="cannot be copied"):
         copy.deepcopy(new(GraphEstimator, log))
+
+
+@BOTH
+def test_a_landmark_seen_twice_at_a_stamp_counts_twice_and_the_same_pose_once(kind, log):
+    estimator, poses = new(kind, log), log.object_poses[""]
+    start = int(poses.stamps_ns[0])
+    samples = log.imu[log.imu.stamps_ns >= start]
+    estimator.feed_imu(start, samples.angular_velocity[0], samples.specific_force[0])
+    seen = poses[(poses.stamps_ns == start) & (poses.object_ids == poses.object_ids[0])]
+    position, q = seen.T_cam_obj.translation, seen.T_cam_obj.rotation.as_quat()
+    for t in (position, position + 0.01, position, position + 0.01):
+        estimator.feed_object_poses(start, seen.object_ids, t, q)
+    assert estimator.health().too_late == 0  # although the first sample is of that stamp
+    assert estimator.health().duplicates == 2
