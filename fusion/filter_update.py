@@ -48,14 +48,17 @@ def take(m: Memory, w: Work, log: Columns, j: int, correcting: bool) -> int:
 
 @njit(cache=True)
 def settle(m: Memory, w: Work, log: Columns, j: int) -> int:
-    """Tie a state that has just started to measurement j, which agreed to it, without moving it; return what passed.
+    """Tie a state that has just started to measurement j, which agreed to it; return what passed.
 
-    The state is at the mean of all that agreed, which one of them knows less of; what errs with it narrows the gate.
+    Of objects the state is at the mean of all that agreed, which one of them knows less of: it does not move, what errs
+    with it narrows the gate. A camera pose, which has no bias, is taken in: it may be far surer than what the mean was
+    carried by (a gyroscope's bias over half a second is half a degree).
     """
     count, decision = _meet_gate(m, w, log, j)
     if decision != ACCEPTED:
         return REJECTED
-    w.residual[:] = 0.0
+    if log.kinds[j] == OBJECT_POSE:
+        w.residual[:] = 0.0
     _correct(m, w, 0, 6, count)
     return ACCEPTED
 

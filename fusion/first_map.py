@@ -24,9 +24,10 @@ Array = NDArray[np.float64]
 UPRIGHT_DEG = 5.0  # 1-sigma: a network turns an object wrong by some degrees for a whole log
 
 
-def lacks_map(log: Log, options: FuseOptions) -> bool:
-    """Tell whether the options ask for an unknown map of a log that has none at all."""
-    return options.estimate.map == "unknown" and log.landmark_map is None and bool(log.object_poses)
+def lacks_map(log: Log, options: FuseOptions, object_poses: ObjectPoses | None = None) -> bool:
+    """Tell whether the options ask for an unknown map of a log that has none at all; object_poses stand in for its."""
+    seen = object_poses is not None or bool(log.object_poses)
+    return options.estimate.map == "unknown" and log.landmark_map is None and seen
 
 
 def with_first_map(log: Log, options: FuseOptions, object_poses: ObjectPoses | None) -> tuple[Log, FuseOptions]:
@@ -34,7 +35,7 @@ def with_first_map(log: Log, options: FuseOptions, object_poses: ObjectPoses | N
 
     As that is upright to some degrees only, the direction of gravity is then estimated too, if there is an IMU.
     """
-    if not lacks_map(log, options) or options.measurements != "objects":
+    if not lacks_map(log, options, object_poses) or options.measurements != "objects":
         return log, options
     poses = object_poses if object_poses is not None else log.detections(None)[1]
     calibration = log.calibration or Calibration()

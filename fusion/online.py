@@ -268,12 +268,17 @@ class Estimator:
 
         stamp_ns on the camera's clock, position (3,) m, quaternion (4,) scalar last. Odometry must come in its own
         order: what is not newer than the last is ignored; against poses and IMU it may be late. Raises InputError
-        unless options.motion is imu+odometry, ValueError for a zero quaternion.
+        unless options.motion is imu+odometry, ValueError for a zero quaternion and other shapes.
         """
         if not self.layout.clone:
             raise InputError("there is no state to measure odometry against", fix="choose --motion imu+odometry")
-        stamp, t = operator.index(stamp_ns), np.asarray(position, dtype=float)
-        R = Rotation.from_quat(np.asarray(q_xyzw, dtype=float)).as_matrix()
+        stamp = operator.index(stamp_ns)
+        t, q = shaped("position", position, 1, 3)[0], shaped("q_xyzw", q_xyzw, 1, 4)[0]
+        if not (q != 0.0).any():
+            raise ValueError("a quaternion is zero")
+        if not np.isfinite(q).all():  # odometry that has lost its way: refused and counted below
+            t, q = np.full(3, np.nan), np.array([0.0, 0.0, 0.0, 1.0])
+        R = Rotation.from_quat(q).as_matrix()
         then_ns, R_then, t_then = self._odometry or (stamp - 10**9, R, t)
         seconds = (stamp - then_ns) * 1e-9
         if seconds <= 0.0 or (self._odometry is not None and seconds < self.options.odometry.step_s - 1e-6):

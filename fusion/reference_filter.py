@@ -216,7 +216,7 @@ class ReferenceFilter:
         residual, H, R, decision = self._meet_gate(log, j)
         if decision != ACCEPTED:
             return REJECTED
-        self.correct(0.0 * residual, H, R)
+        self.correct(0.0 * residual if log.kinds[j] == OBJECT_POSE else residual, H, R)
         return ACCEPTED
 
     def correct(self, residual: Array, H: Array, R: Array) -> None:

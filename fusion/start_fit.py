@@ -1,7 +1,8 @@
 """The correction that votes which agree ask for together: least squares over where their objects are and how turned.
 
 Each vote asks for its object's place and, where it agrees whole, for the attitude it saw; how much either weighs is
-what the detection's noise and biases say. Votes of one object err together, so they weigh as one in attitude and place.
+what the detection's noise and biases say. Votes of one object err together, so they weigh as one in attitude and place;
+camera poses err each by itself.
 """
 
 from __future__ import annotations
@@ -101,6 +102,7 @@ def _add_votes(ballot: Ballot, correction: Correction, A: Array, b: Array) -> No
         agreed, owner = correction.agreed[a & mask], _owner(ballot.votes[a & mask])
         placed[owner] += agreed != 0
         whole[owner] += agreed & WHOLE != 0
+    placed[_OTHERS] = whole[_OTHERS] = 1.0  # camera poses err each by itself; where not, their covariances are wider
     for a in range(ballot.first, ballot.head):
         agreed, owner = correction.agreed[a & mask], _owner(ballot.votes[a & mask])
         if agreed != 0:

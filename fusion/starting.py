@@ -75,9 +75,7 @@ from fusion.so3_kernels import (
     multiply,
     multiply_transposed_right,
 )
-from fusion.tape import (
-    note_restart,
-)
+from fusion.tape import note_restart, survives
 from fusion.votes import (
     VOTE_ACROSS,
     VOTE_ALONG,
@@ -356,7 +354,7 @@ def start_again_in_place(m: Memory, w: Work, missed: Array, seconds: float) -> N
 
 @njit(cache=True)
 def adopt(m: Memory, w: Work, keep_from: int) -> None:
-    """Move the state to the agreed pose; error states before keep_from (all where 0) and object biases start anew."""
+    """Move the state to the agreed pose; error states that do not survive it start anew."""
     if len(m.tape) > 0:
         note_restart(m, keep_from)
     agreed, turned = agreed_correction(m, w), w.step[0:9]
@@ -373,7 +371,7 @@ def adopt(m: Memory, w: Work, keep_from: int) -> None:
     at = m.layout[AT_BIASES]
     biases = 6 * m.layout[N_OBJECTS] * m.layout[N_BIAS_KINDS]
     for i in range(n):
-        if i >= keep_from and keep_from > 0 and not (at >= 0 and at <= i < at + biases):
+        if survives(m, i, keep_from):
             continue
         for j in range(n):
             m.P[i, j] = m.P[j, i] = 0.0

@@ -21,7 +21,7 @@ import numpy as np
 from fusion.compiled import njit
 from fusion.eskf import lever_of_part, parts_carried
 from fusion.measurements import MAX_COLUMNS
-from fusion.memory import AT_TAPE, BIAS_TIME, NOW, TAPE_END, TAPE_SIZE, Memory, Work
+from fusion.memory import AT_TAPE, BIAS_TIME, NOW, RESTARTS, TAPE_END, TAPE_SIZE, Memory, Work
 from fusion.nav_state import (
     AT_BIASES,
     AT_OBJECTS,
@@ -167,13 +167,25 @@ def note_forgetting(m: Memory, k: int, first: int) -> None:
 
 
 @njit(cache=True)
+def survives(m: Memory, i: int, keep_from: int) -> bool:
+    """Tell whether error state i survives a start that keeps those from keep_from on (0: none).
+
+    Biases of objects never do, their poses always: what a filter that gave up knew of them, it still knows.
+    """
+    biases, objects = m.layout[AT_BIASES], m.layout[AT_OBJECTS]
+    if 0 <= biases <= i < biases + 6 * m.layout[N_OBJECTS] * m.layout[N_BIAS_KINDS]:
+        return False
+    if m.counters[RESTARTS] > 0 and 0 <= objects <= i < objects + 6 * m.layout[N_OBJECTS]:
+        return True
+    return 0 < keep_from <= i
+
+
+@njit(cache=True)
 def note_restart(m: Memory, keep_from: int) -> None:
     """Write down which error states survive a restart (`starting.adopt`)."""
     at, n = m.counters[TAPE_END], m.layout[N_ERROR]
-    first, biases = m.layout[AT_BIASES], 6 * m.layout[N_OBJECTS] * m.layout[N_BIAS_KINDS]
     for i in range(n):
-        is_bias = first >= 0 and first <= i < first + biases
-        m.tape[at + i] = 1.0 if i >= keep_from and keep_from > 0 and not is_bias else 0.0
+        m.tape[at + i] = 1.0 if survives(m, i, keep_from) else 0.0
     _close(m, at + n, RESTART)
 
 

@@ -66,6 +66,25 @@ def test_camera_poses_of_the_logs_own_whose_errors_last():
     assert np.mean(found[2.0]) < 2.0
 
 
+@pytest.mark.parametrize("estimator", ["eskf", "graph"])
+@pytest.mark.parametrize(("sigma", "rate_hz"), [(0.001, 10.0), (0.02, 30.0)])
+@pytest.mark.parametrize("rest_s", [0.0, 1.0])
+def test_a_start_is_as_near_as_its_sigmas_say_also_in_motion(estimator, sigma, rate_hz, rest_s):
+    at_first, worst = [], []
+    for seed in range(6):
+        wanted = {"duration_s": 6.0, "imu_rate_hz": 100.0, "camera_rate_hz": rate_hz, "rest_s": rest_s, "seed": seed}
+        accuracy = {"camera_pose_position_sigma_m": sigma, "camera_pose_rotation_sigma_deg": 50.0 * sigma}
+        log = simulate(SimulationOptions(camera_poses=True, **wanted, **accuracy))
+        result = fuse(log, FuseOptions(measurements="camera", estimator=estimator))
+        truth, known = log.T_world_imu.interpolate(result.stamps_ns)
+        at_first.append(pose_nees(result.T_world_imu[known], truth[known], result.pose_covariances[known])[0])
+        error = np.linalg.norm(result.T_world_imu.translation - truth.translation, axis=1)[known]
+        worst.append(error.max())
+        assert result.restarts == 0
+    assert np.mean(at_first) < 2.0
+    assert np.max(worst) < 0.02 + 5.0 * sigma
+
+
 def test_online_tells_that_it_does_not_know_the_rate():
     log = simulate(SimulationOptions(duration_s=1.0, camera_poses=True))
     options = FuseOptions(measurements="camera", camera_noise=CameraNoise(correlation_s=2.0))

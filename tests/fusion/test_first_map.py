@@ -84,3 +84,8 @@ def test_a_map_whose_rotations_mean_nothing_is_told_to_be_left_out(bare, log):
     zeros = [replace(each, T_world_obj=lying * each.T_world_obj) for each in log.landmark_map]
     with pytest.raises(InputError, match=r"never started.*leave landmarks\.json out"):
         fuse(replace(bare, landmark_map=replace(log.landmark_map, landmarks=tuple(zeros))), UNKNOWN)
+
+
+def test_detections_may_be_handed_over_beside_the_log(bare, found):
+    result = fuse(replace(bare, object_poses={}), UNKNOWN, object_poses=bare.object_poses[""])
+    np.testing.assert_array_equal(result.T_world_imu.translation, found.T_world_imu.translation)

@@ -174,3 +174,22 @@ def test_smoother_and_graph_go_over_a_replacement():
         turn, distance = map_errors(log, replace(OPTIONS, estimator=estimator))[3]
         assert turn < 1.0
         assert distance < 0.015
+
+
+@pytest.mark.parametrize("smooth", [False, True])
+def test_a_filter_that_gave_up_is_no_surer_of_the_objects_that_it_had_found(smooth):
+    """Nothing is seen for ten seconds, and without IMU and odometry the filter then starts anew."""
+    log = simulate(SimulationOptions(duration_s=30.0, objects=4, symmetric_objects=0, seed=1))
+    poses, truth = log.object_poses[""], log.landmark_map
+    seconds = (poses.stamps_ns - poses.stamps_ns[0]) * 1e-9
+    poses = poses[(seconds < 8.0) | (seconds > 20.0)]
+    log = replace(log, imu=None, calibration=None, object_poses={"": poses})
+    result = fuse(log, FuseOptions(estimate=Estimate(map="unknown"), smooth=smooth))
+    assert result.restarts > 0
+    found = result.calibrated.landmark_map
+    assert len(found) == 4
+    for landmark, true in list(zip(found, truth, strict=True))[1:]:  # the first is the anchor
+        error = landmark.T_world_obj.translation - true.T_world_obj.translation
+        sigma = np.sqrt(np.diag(landmark.covariance)[3:].max())
+        assert 0.005 < sigma < 0.05
+        assert np.linalg.norm(error) < 3.0 * sigma

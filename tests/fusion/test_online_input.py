@@ -207,3 +207,20 @@ def test_a_landmark_seen_twice_at_a_stamp_counts_twice_and_the_same_pose_once(ki
         estimator.feed_object_poses(start, seen.object_ids, t, q)
     assert estimator.health().too_late == 0  # although the first sample is of that stamp
     assert estimator.health().duplicates == 2
+
+
+@BOTH
+def test_odometry_that_is_not_finite_is_counted_and_of_another_shape_refused(kind, log):
+    estimator = new(kind, log, FuseOptions(motion="imu+odometry"))
+    start, at_rest = int(log.imu.stamps_ns[0]), [0.0, 0.0, 0.0, 1.0]
+    estimator.feed_imu(start, log.imu.angular_velocity[0], log.imu.specific_force[0])
+    estimator.feed_odometry(start, [0.0, 0.0, 0.0], [np.nan, 0.0, 0.0, 1.0])
+    estimator.feed_odometry(start, [np.nan, 0.0, 0.0], at_rest)
+    assert estimator.health().malformed == 2
+    with pytest.raises(ValueError, match="zero"):
+        estimator.feed_odometry(start, [0.0, 0.0, 0.0], [0.0, 0.0, 0.0, 0.0])
+    for position, q in (([0.0, 0.0], at_rest), ([0.0, 0.0, 0.0], at_rest[:3])):
+        with pytest.raises(ValueError, match="must have the shape"):
+            estimator.feed_odometry(start, position, q)
+    estimator.feed_odometry(start, [0.0, 0.0, 0.0], at_rest)
+    assert estimator.health().malformed == 2
