@@ -208,7 +208,7 @@ def _settle_at_agreed(m: Memory, w: Work, log: Columns, first: int, last: int) -
         if m.vote_stamps[at] == m.counters[NOW] and m.votes[at, VOTE_OBJECT] == log.objects[j]:
             slot -= 1
             if m.inliers[at] & WHOLE and log.decisions[j] == REJECTED:
-                log.decisions[j] = settle(m, w, log, j)
+                log.decisions[j] = settle(m, w, log, j, m.votes[at])
 
 
 @njit(cache=True)

@@ -18,6 +18,7 @@ from fusion.object_biases import forget_bias
 from fusion.place_watch import ON_MAP, RELEASED, TURNED, status_of
 from fusion.scatter import follow_scatter
 from fusion.tape import note_correction, note_forgetting, note_meeting
+from fusion.votes import VOTE_ACROSS, VOTE_ALONG, VOTE_TURN
 
 # Places in the limits.
 LIMIT_BOTH, LIMIT_ROTATION, LIMIT_POSITION, PARTIAL, ADAPTATION, MAX_SCALE, JUMP_AFTER, SETTLED = range(8)
@@ -47,18 +48,21 @@ def take(m: Memory, w: Work, log: Columns, j: int, correcting: bool) -> int:
 
 
 @njit(cache=True)
-def settle(m: Memory, w: Work, log: Columns, j: int) -> int:
-    """Tie a state that has just started to measurement j, which agreed to it; return what passed.
+def settle(m: Memory, w: Work, log: Columns, j: int, vote: Array) -> int:
+    """Tie a state that has just started to measurement j, which agreed to it by this vote; return what passed.
 
-    Of objects the state is at the mean of all that agreed, which one of them knows less of: it does not move, what errs
-    with it narrows the gate. A camera pose, which has no bias, is taken in: it may be far surer than what the mean was
-    carried by (a gyroscope's bias over half a second is half a degree).
+    The state is at the mean of all that agreed, which one of them knows less of: it does not move, and what errs with
+    it narrows the gate. But where the pose is off by more than its whole error explains, it is surer than what carried
+    the others (a gyroscope's bias over half a second is half a degree), and the state moves to it.
     """
     count, decision = _meet_gate(m, w, log, j)
     if decision != ACCEPTED:
         return REJECTED
-    if log.kinds[j] == OBJECT_POSE:
-        w.residual[:] = 0.0
+    r, whole = w.residual, (2.0 * vote[VOTE_ACROSS] + vote[VOTE_ALONG]) / 3.0
+    turn = (r[0] * r[0] + r[1] * r[1] + r[2] * r[2]) / vote[VOTE_TURN]
+    place = (r[3] * r[3] + r[4] * r[4] + r[5] * r[5]) / whole
+    if turn <= m.limits[LIMIT_ROTATION] and place <= m.limits[LIMIT_POSITION]:
+        r[:] = 0.0
     _correct(m, w, 0, 6, count)
     return ACCEPTED
 

@@ -59,7 +59,7 @@ from fusion.refused_odometry import follow_refusals
 from fusion.result import FuseResult
 from fusion.scatter import follow_scatter
 from fusion.starting import starts
-from fusion.votes import VOTE_OBJECT
+from fusion.votes import VOTE_ACROSS, VOTE_ALONG, VOTE_OBJECT, VOTE_TURN
 from poet_loc.core.geometry import make_pose
 
 
@@ -212,11 +212,15 @@ class ReferenceFilter:
         root = np.repeat([scale_of(self.m, log.kinds[j], part) for part in (TURN, PLACE)], 3)
         return np.asarray(root[:, None] * log.covariances[j] * root)
 
-    def _settle(self, log: Columns, j: int) -> int:
+    def _settle(self, log: Columns, j: int, vote: Array) -> int:
         residual, H, R, decision = self._meet_gate(log, j)
         if decision != ACCEPTED:
             return REJECTED
-        self.correct(0.0 * residual if log.kinds[j] == OBJECT_POSE else residual, H, R)
+        whole = np.repeat([vote[VOTE_TURN], (2.0 * vote[VOTE_ACROSS] + vote[VOTE_ALONG]) / 3.0], 3)
+        turn, place = np.add.reduceat(residual**2 / whole, [0, 3])
+        limits = self.m.limits
+        off = turn > limits[filter_update.LIMIT_ROTATION] or place > limits[filter_update.LIMIT_POSITION]
+        self.correct(residual if off else 0.0 * residual, H, R)
         return ACCEPTED
 
     def correct(self, residual: Array, H: Array, R: Array) -> None:
@@ -279,14 +283,14 @@ class ReferenceFilter:
         return sorted(order, key=lambda j: float(log.nis[j, 0]))
 
     def _settle_at_agreed(self, log: Columns, first: int, last: int) -> None:
-        """Tie the state to those poses of its start's stamp that agreed, without moving it."""
+        """Tie the state to those poses of its start's stamp that agreed (`filter_update.settle`)."""
         m, slot = self.m, int(self.m.counters[memory.VOTE_HEAD]) - 1
         for j in reversed(range(first, last if not self.layout.time_offset else first)):
             at = slot % len(m.vote_stamps)
             if m.vote_stamps[at] == m.counters[memory.NOW] and m.votes[at, VOTE_OBJECT] == log.objects[j]:
                 slot -= 1
                 if m.inliers[at] & WHOLE and log.decisions[j] == REJECTED:
-                    log.decisions[j] = self._settle(log, j)
+                    log.decisions[j] = self._settle(log, j, m.votes[at])
 
     def measure(self, log: Columns, first: int, last: int) -> None:
         """Take in all measurements of one stamp, then see whether to start or to start again."""
