@@ -96,13 +96,17 @@ def mode_of(silent_s: float, position_sigma: float, refused: int, options: Healt
 
 def run_health(result: FuseResult, options: FuseOptions, begin_ns: int) -> RunHealth:
     """Return how an estimator fared over a log whose motion begins at begin_ns."""
-    which = _modes(result, options.health)
-    changes = np.flatnonzero(np.diff(which, prepend=-1))
-    since, modes = result.stamps_ns[changes], tuple(MODES[i] for i in which[changes])
-    if begin_ns < since[0]:
-        since, modes = np.r_[begin_ns, since], ("initialising", *modes)
     gate, limit = result.gate, float(chi_square_quantile(options.gate.probability, 6))
     started = (gate.stamps_ns > result.stamps_ns[0]) & (gate.stamps_ns <= result.stamps_ns[-1])
+    waited = started & np.isnan(gate.nis)  # the filter had given up: such a pose was asked nothing but where to start
+    gone = result.stamps_ns[np.searchsorted(result.stamps_ns, np.unique(gate.stamps_ns[waited])) - 1] + 1
+    since, which = np.r_[begin_ns, result.stamps_ns, gone], np.r_[0, _modes(result, options.health), 0 * gone]
+    order = np.argsort(since, kind="stable")
+    since, which = since[order], which[order]
+    changes = np.flatnonzero(np.diff(which, prepend=-1))
+    since, modes, started = since[changes], tuple(MODES[i] for i in which[changes]), started & ~waited
+    if since[1:2] == since[:1]:  # it started at the first sample
+        since, modes = since[1:], modes[1:]
     keys = np.stack([gate.object_ids, gate.instances], axis=1)
     objects, released = {}, []
     for key in sorted({(int(i), int(k)) for i, k in keys}):
