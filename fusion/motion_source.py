@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import RigidTransform
 
+from fusion.guessed_motion import shown_motion
 from fusion.measurements import BEFORE_POSES, ODOMETRY_STEP, Measurements
 from fusion.odometry import believed_samples, odometry_samples
 from fusion.options import FuseOptions
@@ -35,14 +36,12 @@ class MotionSource:
     """odometry: what is not known of each sample (`odometry.believed_samples`)."""
 
 
-def motion_source(
-    log: Log, calibration: Calibration, options: FuseOptions, stamps_ns: NDArray[np.int64]
-) -> MotionSource:
-    """Return the source that the options ask for, or the best that the log has.
+def motion_source(log: Log, calibration: Calibration, options: FuseOptions, measured: Measurements) -> MotionSource:
+    """Return the source that the options ask for, or the best that the log has, for these measurements.
 
-    stamps_ns are those of the measurements. Raises InputError where the source or its calibration is missing.
+    Raises InputError where the source or its calibration is missing.
     """
-    kind = motion_of(log, options)
+    kind, stamps_ns = motion_of(log, options), measured.stamps_ns
     if kind == "imu+odometry":
         _odometry_of(log)
         return replace(_imu(log, calibration, options), kind=kind)
@@ -54,7 +53,7 @@ def motion_source(
         T_cam_body = RigidTransform.identity() if calibration.T_cam_imu is None else calibration.T_cam_imu
         samples, doubts = believed_samples(odometry_samples(T_odom_cam, T_cam_body), stamps_ns, options)
         return MotionSource("odometry", samples, ImuNoise(0.0, 0.0, 0.0, 0.0, 0.0), body, doubts)
-    return MotionSource("constant-velocity", _nothing_measured(stamps_ns, options), _smooth(options), body)
+    return MotionSource("constant-velocity", _nothing_measured(stamps_ns, options), _smooth(measured, options), body)
 
 
 def motion_of(log: Log, options: FuseOptions) -> Kind:
@@ -138,6 +137,6 @@ def _nothing_measured(stamps_ns: NDArray[np.int64], options: FuseOptions) -> Imu
     return ImuSamples(stamps, np.zeros((len(stamps), 3)), np.zeros((len(stamps), 3)))
 
 
-def _smooth(options: FuseOptions) -> ImuNoise:
-    model = options.constant_velocity
-    return ImuNoise(0.0, model.acceleration, model.angular_acceleration, 0.0, model.rate_hz)
+def _smooth(measured: Measurements, options: FuseOptions) -> ImuNoise:
+    acceleration, angular_acceleration = shown_motion(measured, options.constant_velocity)
+    return ImuNoise(0.0, acceleration, angular_acceleration, 0.0, options.constant_velocity.rate_hz)

@@ -94,7 +94,7 @@ def pose_problem(
     refuse_other_units(measured.stamps_ns, FASTEST_CAMERA_HZ, log.path)
     if log.imu is not None:
         refuse_other_units(log.imu.stamps_ns, FASTEST_IMU_HZ, log.path / "imu.csv")
-    source = motion_source(log, calibration, options, measured.stamps_ns)
+    source = motion_source(log, calibration, options, measured)
     if source.kind == "imu+odometry":
         layout = replace(layout, clone=True)
         measured = Measurements.merged(odometry_steps(log, calibration, options), measured)
