@@ -18,6 +18,7 @@ from fusion.eskf import POSITION_ONLY, ROTATION_ONLY
 from fusion.first_map import with_first_map
 from fusion.health import run_health
 from fusion.measurements import ODOMETRY_STEP, Measurements
+from fusion.never_started import never_started
 from fusion.noise_scale import widening
 from fusion.options import FuseOptions
 from fusion.place_watch import RELEASED
@@ -111,30 +112,6 @@ def loop_columns(problem: Problem) -> tuple[Columns, Rows]:
     )
     sizes = (OUT_CORE, OUT_SIGMA, OUT_COVARIANCE)
     return columns, Rows(np.zeros(rows, dtype=np.int64), *(np.zeros((rows, size)) for size in sizes))
-
-
-def never_started(problem: Problem, options: FuseOptions) -> InputError:
-    """Return the error of a filter whose start's conditions were never met."""
-    begin, poses = options.start, problem.measurements.stamps_ns[problem.measurements.kinds != ODOMETRY_STEP]
-    file = "T_odom_cam.tum" if problem.motion == "odometry" else "imu.csv"
-    span = problem.imu.stamps_ns if len(problem.imu) else poses[:0]
-    inside = np.count_nonzero((poses >= span[0]) & (poses <= span[-1])) if len(span) else 0
-    also = {"odometry": " and with the odometry", "constant-velocity": ""}.get(problem.motion, " and with gravity")
-    neither = f"no {begin.min_votes} poses, nor {begin.few_votes} over {begin.few_span_s} s,"
-    few = min(begin.few_votes, begin.min_votes)
-    if inside < few <= len(poses):
-        return InputError(
-            f"the filter never started: {inside} of {len(poses)} poses lie between its first and last stamp",
-            path=problem.path / file,
-            fix="put both on one clock (poet-loc check tells what they cover), or choose another --motion",
-        )
-    return InputError(
-        f"the filter never started: {neither} agree with each other{also}",
-        path=problem.path,
-        fix="see what poet-loc check says of the log, relax --start, or give --start.pose"
-        if options.estimate.map != "unknown"
-        else "of an unknown map the anchor's rotation counts: where it is not known, leave landmarks.json out",
-    )
 
 
 def with_findings(result: FuseResult, problem: Problem, m: memory.Memory) -> FuseResult:

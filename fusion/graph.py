@@ -5,12 +5,13 @@ from __future__ import annotations
 import time
 
 from fusion.coarse_offset import retimed
-from fusion.fuse import gate_log, never_started, result_from_rows, run_filter, with_findings
+from fusion.fuse import gate_log, result_from_rows, run_filter, with_findings
 from fusion.graph_batch import run_batch
 from fusion.graph_fixed import new_builder
 from fusion.graph_motion import MotionChain
 from fusion.graph_smoother import FixedLagSmoother
 from fusion.graph_walk import Walk
+from fusion.never_started import never_started
 from fusion.options import FuseOptions
 from fusion.prepare import WITH_IMU, Problem
 from fusion.result import FuseResult

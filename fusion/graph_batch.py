@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from fusion import eskf, memory
 from fusion.eskf import ACCEPTED
 from fusion.filter_update import PARTIAL
-from fusion.fuse import gate_log, never_started, result_from_rows, with_findings
+from fusion.fuse import gate_log, result_from_rows, with_findings
 from fusion.graph_builder import GraphBuilder
 from fusion.graph_factors import Detection, error_at
 from fusion.graph_gnc import Truncation, anneal
@@ -26,6 +26,7 @@ from fusion.graph_variables import block_diagonal, keyframe_variables
 from fusion.graph_walk import Keyframe, Walk
 from fusion.measurements import OBJECT_POSE, ODOMETRY_STEP
 from fusion.nav_state import CORE
+from fusion.never_started import never_started
 from fusion.options import FuseOptions, Graph
 from fusion.place_watch import RELEASED
 from fusion.prepare import Problem

@@ -91,6 +91,7 @@ RANGES: dict[str, tuple[str, ...]] = {
         "start.max_distance",
         "start.max_lever",
         "start.max_speed",
+        "start.max_camera_speed",
         "start.max_tilt_deg",
         "graph.relinearize_every",
         "graph.rounds",

@@ -221,7 +221,9 @@ class Start:
     max_lever: float = 0.04
     """plus this share of the object's distance,"""
     max_speed: float = 0.3
-    """plus so much per second between them, m/s."""
+    """plus so much per second between them, m/s,"""
+    max_camera_speed: float = 1.0
+    """and votes that are camera poses, whose errors tell speeds better, plus so much, m/s."""
     max_tilt_deg: float = 8.0
     """A vote that tilts the measured gravity by more is refused, deg."""
     lost_window_s: float = 4.0

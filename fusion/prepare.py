@@ -55,6 +55,8 @@ class Problem:
     body: Literal["imu", "cam"] = "imu"
     doubts: Array | None = None
     """odometry: what is not known of each sample (`odometry.believed_samples`)."""
+    lasting_s: float = 0.0
+    """How long the camera poses' errors are taken to last, s: their covariances are so much larger than stated."""
 
     @property
     def rows(self) -> Array:
@@ -78,7 +80,7 @@ def pose_problem(
     Raises InputError where motion, calibration, map or poses are missing, or stamps are no nanoseconds.
     """
     calibration = log.calibration or Calibration()
-    layout = layout_for(log.landmark_map, options)
+    layout, lasting_s = layout_for(log.landmark_map, options), 0.0
     if options.measurements == "camera":
         poses = camera_poses if camera_poses is not None else log.camera_poses
         if poses is None:
@@ -101,7 +103,7 @@ def pose_problem(
     if source.kind not in WITH_IMU and options.estimate.gravity:
         raise InputError(f"{source.kind} feels no gravity", fix="do not estimate its direction")
     motion = (source.samples, source.noise, calibration, measured, layout, log.landmark_map, source.kind, source.body)
-    return Problem(log.path, *motion, source.doubts)
+    return Problem(log.path, *motion, source.doubts, lasting_s)
 
 
 def landmark_of_detection(poses: ObjectPoses, landmark_map: LandmarkMap) -> NDArray[np.int64]:
@@ -344,7 +346,7 @@ def _start(options: FuseOptions) -> list[float]:
         ballot.MAX_ANGLE: math.radians(start.max_angle_deg),
         ballot.MAX_DISTANCE: start.max_distance,
         ballot.MAX_LEVER: start.max_lever,
-        ballot.MAX_SPEED: start.max_speed,
+        ballot.MAX_SPEED: start.max_camera_speed if options.measurements == "camera" else start.max_speed,
         ballot.MAX_TILT: math.radians(start.max_tilt_deg),
         ballot.START_WINDOW_S: start.window_s,
         ballot.START_MIN_SPAN_S: start.min_span_s,

@@ -15,8 +15,9 @@ from numpy.typing import NDArray
 
 from fusion import filter_loop, memory, tape
 from fusion.columns import OUT_CORE, Columns, Rows
-from fusion.fuse import gate_log, loop_columns, never_started, result_from_rows, with_findings
+from fusion.fuse import gate_log, loop_columns, result_from_rows, with_findings
 from fusion.nav_state import CORE, StateLayout
+from fusion.never_started import never_started
 from fusion.options import FuseOptions
 from fusion.prepare import Problem, fill_memory
 from fusion.result import FuseResult

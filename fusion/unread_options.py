@@ -47,7 +47,9 @@ def _asked(ask: Callable[[FuseOptions], Any]) -> Callable[[Reader], bool]:
     return lambda reader: bool(ask(reader.options))
 
 
-_OF_OBJECTS = "noise.* bias.* moved.* meeting.* estimate.map prior.map_* start.min_objects start.min_places"
+_OF_OBJECTS = (
+    "noise.* bias.* moved.* meeting.* estimate.map prior.map_* start.min_objects start.min_places start.max_speed"
+)
 
 RULES: tuple[Rule[Reader], ...] = (
     Rule("graph.*", "the estimators graph and batch", _estimator("graph", "batch")),
@@ -58,7 +60,7 @@ RULES: tuple[Rule[Reader], ...] = (
     Rule("moved.then", "the estimator eskf", _estimator("eskf")),
     Rule("moved.[!r]*", "moved.release", _asked(lambda o: o.moved.release)),
     Rule(_OF_OBJECTS, "--measurements objects", _measurements("objects")),
-    Rule("camera_noise.*", "--measurements camera", _measurements("camera")),
+    Rule("camera_noise.* start.max_camera_speed", "--measurements camera", _measurements("camera")),
     Rule("camera_noise.solver_correlation_s", "camera poses of the solver", lambda reader: reader.solved),
     Rule("camera_noise.[!s]*", "camera poses of the log's own", lambda reader: not reader.solved),
     Rule("noise.stated_*", "detections with covariances", lambda reader: reader.stated),
