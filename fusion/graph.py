@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import time
 
+import numpy as np
+
 from fusion.coarse_offset import retimed
 from fusion.fuse import gate_log, result_from_rows, run_filter, with_findings
 from fusion.graph_batch import run_batch
@@ -15,6 +17,7 @@ from fusion.never_started import never_started
 from fusion.options import FuseOptions
 from fusion.prepare import WITH_IMU, Problem
 from fusion.result import FuseResult
+from poet_loc.core.input_error import InputError
 
 _FAR_OFF_S = 0.02
 
@@ -22,10 +25,17 @@ _FAR_OFF_S = 0.02
 def run_graph(problem: Problem, options: FuseOptions) -> FuseResult:
     """Fuse a log with the factor graph: `graph` is causal (fixed lag), `batch` smooths the whole log.
 
-    Raises InputError where the start's conditions are never met.
+    Raises InputError where the start's conditions are never met, and where the graph has no solution.
     """
     problem = _timed(problem, options)
-    return run_batch(problem, options) if options.estimator == "batch" else run_fixed_lag(problem, options)
+    try:
+        return run_batch(problem, options) if options.estimator == "batch" else run_fixed_lag(problem, options)
+    except (RuntimeError, np.linalg.LinAlgError) as error:  # gtsam's "Indeterminate linear system", over several lines
+        raise InputError(
+            f"the graph cannot be solved ({' '.join(str(error).split())[:80]})",
+            path=problem.path,
+            fix="see what fuse/eskf does; gross errors must not pass the gate (--gate.probability below 1)",
+        ) from error
 
 
 def _timed(problem: Problem, options: FuseOptions) -> Problem:

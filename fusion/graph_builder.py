@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import gtsam
 import numpy as np
@@ -245,9 +245,14 @@ class GraphBuilder:
                 self.x[variable.at : variable.at + OBJECT_SIZE] = x[variable.at : variable.at + OBJECT_SIZE]
 
     def follow_spreads(self, x: Array) -> None:
-        """Let the objects' biases spread, from here on, as a nominal array of the filter says."""
-        for own in (self.x, self.origin, self.model.x):
-            own[self._spreads] = x[self._spreads]
+        """Let the objects' biases spread, from here on, as a nominal array of the filter says.
+
+        Factors keep the model that they were made with: whenever they are linearised, their biases spread as then.
+        """
+        spreads = x[self._spreads]
+        self.x[self._spreads] = self.origin[self._spreads] = spreads
+        if not np.array_equal(self.model.x[self._spreads], spreads):
+            self.model = replace(self.model, x=np.append(self.model.x[: self._spreads.start], spreads))
 
     def _meet(self, k: int) -> None:
         """Add an object's pose where it is seen for the first time."""

@@ -40,6 +40,7 @@ class FixedLagSmoother:
         self._isam = gtsam.ISAM2(isam_parameters(options))
         self._came: dict[int, list[int]] = {}  # per keyframe, what does not last
         self._lasting: dict[int, None] = {}
+        self._pinned: set[int] = set()  # what was marginalised holds them where they were linearised
         self._first = builder.keyframe + 1
         self._factors, self._theta = gtsam.NonlinearFactorGraph(), gtsam.Values()
 
@@ -51,6 +52,7 @@ class FixedLagSmoother:
             if factor is not None:
                 other._factors.add(factor)
         other._theta = gtsam.Values(self._isam.getLinearizationPoint())
+        other._pinned = self._pinned.union(self._isam.getFixedVariables())
         del other._isam
         return other
 
@@ -139,7 +141,10 @@ class FixedLagSmoother:
         for key in again:
             if not values.exists(key):
                 old.push_back(key)
-        result = self._isam.update(graph, values, [], groups, None, old, anew)
+        pinned = gtsam.KeyList()
+        for key in self._pinned if anew else ():
+            pinned.push_back(key)
+        result = self._isam.update(graph, values, [], groups, pinned, old, anew)
         return whole or int(result.getVariablesReeliminated()) <= certain
 
     def _let_go(self, until: int) -> None:

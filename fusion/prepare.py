@@ -296,10 +296,13 @@ def _map_prior(landmark_map: LandmarkMap, layout: StateLayout, sigma: Array) -> 
 
 
 def _check_anchor(problem: Problem) -> None:
-    """Raise InputError where no object could anchor a world whose map is unknown (`meeting.choose_anchor`)."""
+    """Raise InputError where no object could anchor a world whose map is unknown (`meeting.choose_anchor`).
+
+    Online, where nothing has been seen yet, any object of the map may be.
+    """
     landmarks = [] if problem.landmark_map is None else list(problem.landmark_map)
     seen = np.unique(problem.measurements.objects[problem.measurements.kinds == OBJECT_POSE])
-    if len(seen) and all(landmarks[k].symmetry is not None for k in seen):
+    if all(landmarks[k].symmetry is not None for k in (seen if len(seen) else range(len(landmarks)))):
         raise InputError("no object without symmetry is seen, so none can anchor the world", path=problem.path)
 
 

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from filter_runs import simulated
 
+from fusion import graph
 from fusion.eskf import ACCEPTED
 from fusion.fuse import fuse, run_filter
 from fusion.graph import run_graph
@@ -320,3 +321,13 @@ def test_a_log_on_which_the_filter_never_starts_says_so():
     for estimator in ("graph", "batch"):
         with pytest.raises(InputError, match="never started"):
             run_graph(replace(problem, measurements=late), FuseOptions(measurements="camera", estimator=estimator))
+
+
+@pytest.mark.parametrize("estimator", ["graph", "batch"])
+def test_a_graph_without_a_solution_ends_in_one_line(estimator, monkeypatch):
+    def indeterminate(*_):
+        raise RuntimeError("\nIndeterminate linear system detected\nwhile working near variable x3")
+
+    monkeypatch.setattr(graph, "run_batch" if estimator == "batch" else "run_fixed_lag", indeterminate)
+    with pytest.raises(InputError, match=r"Indeterminate linear system detected while .*; see what fuse/eskf does"):
+        graph.run_graph(simulated(), FuseOptions(estimator=estimator))

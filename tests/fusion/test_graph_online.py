@@ -190,3 +190,18 @@ def test_a_restart_undone_by_late_poses_leaves_no_trace(rate_hz):
     fed.all(np.random.default_rng(1).uniform(0.0, 1.5e9, len(m)))
     assert fed.estimator.health().restarts == 1
     assert_same_state(fed.estimator.state(), whole, 1e-3)
+
+
+def test_late_poses_give_the_result_in_order_where_factors_are_linearised_anew():
+    """Biases that spread more by and by: what was seen before is linearised as it was then."""
+    options = replace(OPTIONS, graph=replace(OPTIONS.graph, relinearize_every=3))
+    problem = simulated(options=options, noise="network")
+    m, states = problem.measurements, []
+    growing = np.linspace(0.5, 4.0, len(m))[:, None, None]
+    problem = replace(problem, measurements=replace(m, covariances=growing * m.covariances))
+    for delays in (np.zeros(len(m)), np.random.default_rng(0).uniform(0.0, 0.5e9, len(m))):
+        fed = Feed(problem, options)
+        fed.all(delays)
+        states.append(fed.estimator.state())
+    np.testing.assert_allclose(states[0].position, states[1].position, atol=1e-6)
+    np.testing.assert_allclose(states[0].sigmas, states[1].sigmas, rtol=1e-4)

@@ -224,3 +224,10 @@ def test_odometry_that_is_not_finite_is_counted_and_of_another_shape_refused(kin
             estimator.feed_odometry(start, position, q)
     estimator.feed_odometry(start, [0.0, 0.0, 0.0], at_rest)
     assert estimator.health().malformed == 2
+
+
+@BOTH
+def test_an_unknown_map_of_symmetric_objects_alone_is_refused_as_on_a_whole_log(kind):
+    log = simulate(SimulationOptions(duration_s=2.0, objects=2, symmetric_objects=2))
+    with pytest.raises(InputError, match="none can anchor the world"):
+        new(kind, log, FuseOptions(estimate=Estimate(map="unknown")))
