@@ -34,8 +34,8 @@ from fusion.so3_kernels import (
 
 LINK_SIZES = 6, 3, 6, 6, 3, 6, 3  # columns of a link: pose, velocity and biases of both keyframes, gravity
 
-_SMALLEST_DENSITY = 1e-8  # a noise density of zero has no information matrix
-_INTEGRATION = 1e-5  # m/sqrt(s): what the midpoint rule leaves
+SMALLEST_DENSITY = 1e-8  # a noise density of zero has no information matrix
+INTEGRATION = 1e-5  # m/sqrt(s): what the midpoint rule leaves
 
 
 @njit(cache=True, _nrt=True)
@@ -53,12 +53,12 @@ def link_keyframes(
     _local(now, x, gap)
     rows = np.zeros((CORE, 2 * CORE + (4 if gravity else 1)))
     for i in range(CORE):
-        Q[i, i] += _SMALLEST_DENSITY**2 * seconds
+        Q[i, i] += SMALLEST_DENSITY**2 * seconds
         for j in range(CORE):
             rows[i, j] = -F[i, j]
         rows[i, CORE + i], rows[i, -1] = 1.0, gap[i]
     for i in range(3):
-        Q[POSITION_ERROR + i, POSITION_ERROR + i] += _INTEGRATION**2 * seconds
+        Q[POSITION_ERROR + i, POSITION_ERROR + i] += INTEGRATION**2 * seconds
         if gravity:
             rows[POSITION_ERROR + i, 2 * CORE + i] = -0.5 * seconds * seconds
             rows[VELOCITY_ERROR + i, 2 * CORE + i] = -seconds

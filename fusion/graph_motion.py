@@ -8,6 +8,7 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
+from fusion.graph_link import INTEGRATION, SMALLEST_DENSITY
 from fusion.graph_model import MOTION_SIZE, SHIFT, TURN, imu_between, motion_between, move, rate_at
 from fusion.graph_variables import GRAVITY_KEY, imu_bias, imu_bias_key, pose_key, velocity_key
 from fusion.imu_noise import ACCEL_SQUARES, GYRO_SQUARES, density_squared
@@ -20,8 +21,6 @@ from poet_loc.core.records import ImuNoise
 Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
-_SMALLEST_DENSITY = 1e-8  # a noise density of zero has no information matrix
-_INTEGRATION = 1e-5  # m/sqrt(s): what the midpoint rule leaves
 _STILL = np.zeros(6)
 _IDENTITY = np.eye(3)
 
@@ -109,12 +108,12 @@ class MotionChain:
         gyro = density_squared(self.noise.gyroscope_noise_density, row, GYRO_SQUARES, measured)
         accel = density_squared(self.noise.accelerometer_noise_density, row, ACCEL_SQUARES, measured)
         gyro, accel = gyro + gap_s * gap.angular_rate**2, accel + gap_s * gap.acceleration**2
-        floor = _SMALLEST_DENSITY**2
+        floor = SMALLEST_DENSITY**2
         params.setGyroscopeCovariance((gyro + floor) * _IDENTITY)
         params.setAccelerometerCovariance((accel + floor) * _IDENTITY)
         params.setBiasOmegaCovariance((self.noise.gyroscope_random_walk**2 + floor) * _IDENTITY)
         params.setBiasAccCovariance((self.noise.accelerometer_random_walk**2 + floor) * _IDENTITY)
-        params.setIntegrationCovariance(_INTEGRATION**2 * _IDENTITY)
+        params.setIntegrationCovariance(INTEGRATION**2 * _IDENTITY)
         return params
 
 

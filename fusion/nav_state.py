@@ -35,7 +35,7 @@ OBJECT_SIZE = 12
 SPREAD_SIZE, SPREAD_COUNT = 4, 3
 
 # Places in the error state.
-ATTITUDE_ERROR, POSITION_ERROR, VELOCITY_ERROR, GYRO_BIAS_ERROR, ACCEL_BIAS_ERROR = 0, 3, 6, 9, 12
+POSITION_ERROR, VELOCITY_ERROR, GYRO_BIAS_ERROR, ACCEL_BIAS_ERROR = 3, 6, 9, 12  # the attitude's comes first
 CORE = 15
 
 # Places in the integer layout that the compiled loops read; -1 there means switched off.

@@ -39,7 +39,7 @@ from fusion.object_biases import bias_phi, fades
 from fusion.so3_kernels import multiply_transposed_left
 
 STEP, ODOMETRY, DECAY, CORRECTION, MEETING, FORGETTING, RESTART, ROW, CLONING = range(9)
-STEP_SIZE, TAIL = 54, 2
+STEP_SIZE, TAIL = 52, 2
 
 
 def with_tape(floats: Array, integers: Ints, size: int) -> tuple[Array, Ints]:

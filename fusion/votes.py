@@ -6,16 +6,13 @@ import math
 
 from fusion.compiled import njit
 from fusion.nav_state import Array
-from fusion.so3_kernels import apply, apply_transposed, exp_so3, log_so3, multiply, multiply_transposed_right
+from fusion.so3_kernels import apply, apply_transposed, exp_so3, multiply, multiply_transposed_right
+from fusion.symmetry import twist_about
 
-# Pose of the imu as voted, as integrated; distance of the object, the object in imu axes seen from the imu, and in the
-# world; its symmetry: axis in the world, order (1 none, 0 continuous); its number, -1: a camera pose;
-# variances of the whole error: of attitude (rad^2), of place across and along the arm (m^2).
+# Poses of the imu as voted (0-11) and as integrated (12-23); then the distance of the object, the object in imu axes seen
+# from the imu, and in the world; its symmetry: axis in the world, order (1 none, 0 continuous); its number, -1: a camera
+# pose; variances of the whole error: of attitude (rad^2), of place across and along the arm (m^2).
 (
-    VOTE_ROTATION,
-    VOTE_POSITION,
-    MOTION_ROTATION,
-    MOTION_POSITION,
     VOTE_DISTANCE,
     VOTE_ARM,
     VOTE_PLACE,
@@ -26,7 +23,7 @@ from fusion.so3_kernels import apply, apply_transposed, exp_so3, log_so3, multip
     VOTE_ACROSS,
     VOTE_ALONG,
     VOTE_SIZE,
-) = (0, 9, 12, 21, 24, 25, 28, 31, 34, 35, 36, 37, 38, 39)
+) = (24, 25, 28, 31, 34, 35, 36, 37, 38, 39)
 
 _STANDS = math.sin(math.radians(20.0))  # an axis nearer to the vertical says nothing of the heading
 _APART = 0.1  # m, objects that tell a heading
@@ -41,14 +38,7 @@ def fit_vote(vote: Array, R: Array, out: Array, scratch: Array) -> None:
         return
     difference, vector, axis, arm = scratch[0:9], scratch[9:12], vote[31:34], vote[25:28]
     multiply_transposed_right(R, vote[0:9], difference)
-    log_so3(difference, vector)
-    angle = math.sqrt(vector[0] ** 2 + vector[1] ** 2 + vector[2] ** 2)
-    along = axis[0] * vector[0] + axis[1] * vector[1] + axis[2] * vector[2]
-    sine = along * (math.sin(0.5 * angle) / angle if angle > 1e-9 else 0.5)
-    twist = 2.0 * math.atan2(sine, math.cos(0.5 * angle))
-    if vote[VOTE_ORDER] > 1.0:
-        step = 2.0 * math.pi / vote[VOTE_ORDER]
-        twist = step * math.floor(twist / step + 0.5)
+    twist = twist_about(axis, int(vote[VOTE_ORDER]), difference, vector)
     exp_so3(twist * axis[0], twist * axis[1], twist * axis[2], difference)
     multiply(difference, vote[0:9], out)
     apply(out, arm[0], arm[1], arm[2], vector)
