@@ -9,9 +9,9 @@ from fusion.nav_state import Array
 from fusion.so3_kernels import apply, apply_transposed, exp_so3, multiply, multiply_transposed_right
 from fusion.symmetry import twist_about
 
-# Poses of the imu as voted (0-11) and as integrated (12-23); then the distance of the object, the object in imu axes seen
-# from the imu, and in the world; its symmetry: axis in the world, order (1 none, 0 continuous); its number, -1: a camera
-# pose; variances of the whole error: of attitude (rad^2), of place across and along the arm (m^2).
+# Poses of the imu as voted (0-11) and as integrated (12-23), then the distance of the object, the object in imu axes
+# seen from the imu, and in the world; its symmetry: axis in the world, order (1 none, 0 continuous); its number, -1: a
+# camera pose; variances of the whole error: of attitude (rad^2), of place across and along the arm (m^2).
 (
     VOTE_DISTANCE,
     VOTE_ARM,
