@@ -137,13 +137,14 @@ class Estimator:
 
     def __init__(
         self,
-        calibration: Calibration,
+        calibration: Calibration | None,
         landmark_map: LandmarkMap | None = None,
         options: FuseOptions | None = None,
         online: OnlineOptions | None = None,
         layout: StateLayout | None = None,
     ) -> None:
         self.options, self.online = options or FuseOptions(), online or OnlineOptions()
+        calibration = calibration or Calibration()
         if self.options.estimator != self._estimator or self.options.smooth:
             what = f"{type(self).__name__} is no {'smoother' if self.options.smooth else self.options.estimator}"
             raise InputError(what, fix="Estimator is the filter (eskf), GraphEstimator the fixed-lag graph (graph)")

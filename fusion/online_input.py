@@ -46,7 +46,8 @@ def shaped(name: str, values: ArrayLike, *shape: int) -> NDArray[np.float64]:
         return given.reshape(shape)
     if shape[0] == 1 and given.shape == shape[1:]:
         return given[None]
-    raise ValueError(f"{name} must have the shape {shape}, not {given.shape}")
+    wanted = shape[1:] if shape[0] == 1 else shape
+    raise ValueError(f"{name} must have the shape {wanted}, not {given.shape}")
 
 
 def vector(name: str, values: ArrayLike) -> NDArray[np.float64]:

@@ -19,7 +19,7 @@ from poet_loc.check.objects import (
 )
 from poet_loc.check.odometry import check_odometry
 from poet_loc.check.reading import read_what_there_is
-from poet_loc.check.stamps import check_rate, check_spans, check_stamps
+from poet_loc.check.stamps import check_imu_covers, check_rate, check_spans, check_stamps
 from poet_loc.check.turns import check_turns, unreadable_calibration
 from poet_loc.check.units import check_accelerometer, check_gyroscope, check_lengths
 from poet_loc.core.records import Calibration
@@ -32,6 +32,7 @@ CHECKS: tuple[Check, ...] = (
     check_stamps,
     check_rate,
     check_spans,
+    check_imu_covers,
     check_unknown_objects,
     check_rotations_against_map,
     check_lengths,
@@ -86,7 +87,7 @@ def _missing(log: Log) -> list[Finding]:
 
 
 def _nothing_seen(log: Log) -> Iterator[Finding]:
-    if log.camera_poses is not None or (log.object_poses and log.landmark_map is not None):
+    if (log.path / "camera_poses.csv").exists() or (log.object_poses and log.landmark_map is not None):
         return
     file = "landmarks.json" if log.object_poses else object_poses_file("")
     if not (log.path / file).exists():  # one that cannot be read is told already

@@ -10,13 +10,14 @@ import numpy as np
 from poet_loc.check.finding import Evidence, Finding
 from poet_loc.check.streams import Stream, streams_of, with_stamps
 from poet_loc.core.stamp_unit import FASTEST_CAMERA_HZ, FASTEST_IMU_HZ
-from poet_loc.io.log_folder import Log
+from poet_loc.io.log_folder import Log, object_poses_file
 
 _SLOWEST_HZ = 0.02
 _GAP_IMU_INTERVALS, _GAP_IMU_S, _GAP_CAMERA_S = 5.0, 0.04, 8.0
 _JITTER_SHARE = 0.25  # of the median interval, typical deviation
 _RATE_TOLERANCE = 0.1
 _SHORT_OVERLAP = 0.2
+_COVERED_BY_IMU = 0.9
 _UNITS_NS = {"microseconds": 1_000, "milliseconds": 1_000_000, "seconds": 1_000_000_000}
 
 
@@ -121,3 +122,23 @@ def check_spans(log: Log) -> Iterator[Finding]:
             how = "no time" if common < 0 else "little time"
             what, fix = f"has {how} in common with {other}", "bring all stamps to one clock, in nanoseconds"
             yield Finding("span", "error" if common < 0 else "warning", file, what, fix, evidence)
+
+
+def check_imu_covers(log: Log) -> Iterator[Finding]:
+    """Yield an IMU that was not there for a part of what the camera saw: nothing is fused of that."""
+    if log.imu is None or not len(log.imu):
+        return
+    shift_ns = round((log.calibration.timeshift_cam_imu_s if log.calibration else 0.0) * 1e9)
+    begin, end = int(log.imu.stamps_ns[0]), int(log.imu.stamps_ns[-1])
+    poses = {object_poses_file(name): each for name, each in log.object_poses.items()}
+    for file, each in (poses | {"camera_poses.csv": log.camera_poses}).items():
+        if each is None or not len(each):
+            continue
+        seen = each.stamps_ns + shift_ns
+        covered = float(np.mean((seen >= begin) & (seen <= end)))
+        if 0.0 < covered < _COVERED_BY_IMU:  # none at all: check_spans
+            evidence: Evidence = {"covered_share": covered, "imu_span_s": (end - begin) * 1e-9}
+            fix = (
+                "record both for as long; what is outside is not fused (--fusion.motion constant-velocity needs no IMU)"
+            )
+            yield Finding("imu-span", "warning", "imu.csv", f"covers {covered:.0%} of {file}", fix, evidence)

@@ -100,7 +100,7 @@ def check_gyroscope(log: Log) -> Iterator[Finding]:
         repair = _scaled_imu(np.pi / 180.0, 1.0)
         yield Finding("gyroscope-degrees", "warning", "imu.csv", f"{what}: degrees, it seems", fix, evidence, repair)
     else:
-        fix = "calibrate the gyroscope at rest, or see whether it is in degrees"
+        fix = "calibrate the gyroscope at rest, fuse with --prior.gyroscope-bias 0.25, or see whether it is in degrees"
         yield Finding("gyroscope-bias", "error", "imu.csv", f"{what}: a large bias", fix, evidence)
 
 

@@ -304,7 +304,17 @@ def broken_json(folder: Path) -> None:
 
 IMU_FLIPPED_Y = np.diag([1.0, -1.0, 1.0])
 
+
 # name: (how it is spoiled, the checks that name it, whether --fix leaves a log without findings)
+def short_imu(log: Log) -> Log:
+    return replace(log, imu=log.imu[: len(log.imu) * 3 // 5], T_world_imu=None)
+
+
+def foreign_camera_poses(folder: Path) -> None:
+    (folder / "object_poses.csv").unlink()
+    (folder / "camera_poses.csv").write_text("0.1;1;2;3;0;0;0;1\n")
+
+
 SPOILED_LOGS: dict[str, tuple[SpoilLog, set[str], bool]] = {
     "gyroscope in degrees": (imu(gyroscope=180.0 / np.pi), {"gyroscope-degrees"}, True),
     "gyroscope never zeroed": (biased_gyroscope, {"gyroscope-bias"}, False),
@@ -325,6 +335,7 @@ SPOILED_LOGS: dict[str, tuple[SpoilLog, set[str], bool]] = {
     "odometry that ends early": (part_of_odometry(0.0, 5.0), {"odometry-hole"}, False),
     "stamps of receipt": (receive_times, {"jitter"}, False),
     "stamps in microseconds": (microseconds, {"stamp-unit"}, True),
+    "imu ends early": (short_imu, {"imu-span"}, False),
     "imu on another clock": (other_clock, {"span"}, False),
     "update rate": (noise(update_rate=0.5), {"rate"}, False),
     "T_cam_imu inverted": (inverse_extrinsics, {"extrinsics-inverted"}, True),
@@ -367,6 +378,7 @@ SPOILED_FILES: dict[str, tuple[SpoilFolder, set[str], bool]] = {
     "no calibration": (lambda folder: (folder / "calibration.yaml").unlink(), {"missing"}, False),
     "calibration of another name": (renamed_camera, {"missing"}, False),
     "calibration no yaml": (lambda folder: (folder / "calibration.yaml").write_text("cam0: ["), {"unreadable"}, False),
+    "camera poses of another program": (foreign_camera_poses, {"unreadable"}, False),
     "map no json": (broken_json, {"unreadable"}, False),
 }
 

@@ -231,3 +231,18 @@ def test_an_unknown_map_of_symmetric_objects_alone_is_refused_as_on_a_whole_log(
     log = simulate(SimulationOptions(duration_s=2.0, objects=2, symmetric_objects=2))
     with pytest.raises(InputError, match="none can anchor the world"):
         new(kind, log, FuseOptions(estimate=Estimate(map="unknown")))
+
+
+@BOTH
+def test_a_log_without_calibration_is_told_what_is_missing(kind):
+    with pytest.raises(InputError, match="T_cam_imu and the IMU's noise densities"):
+        kind(None, None, FuseOptions(estimator=kind._estimator, measurements="camera"))
+
+
+@BOTH
+def test_shapes_are_told_as_they_are_documented(kind, log):
+    estimator = kind(log.calibration, None, FuseOptions(estimator=kind._estimator, measurements="camera"))
+    with pytest.raises(ValueError, match=r"position must have the shape \(3,\), not \(2,\)"):
+        estimator.feed_camera_pose(1, [0.0, 0.0], [0.0, 0.0, 0.0, 1.0])
+    with pytest.raises(ValueError, match=r"covariance must have the shape \(6, 6\), not \(3, 3\)"):
+        estimator.feed_camera_pose(1, [0.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0], np.eye(3))
