@@ -24,7 +24,7 @@ from fusion.votes import VOTE_ACROSS, VOTE_ALONG, VOTE_TURN
 LIMIT_BOTH, LIMIT_ROTATION, LIMIT_POSITION, PARTIAL, ADAPTATION, MAX_SCALE, JUMP_AFTER, SETTLED = range(8)
 
 GROSS = 10.0  # times the limit of the rotation's nis
-FAR_OFF = 4.0  # times the limit of a half: by twice what its error explains, which mostly is stated too small
+FAR_OFF = 4.0  # times the limit of a half: what detections state of themselves mostly is half of their error
 LINEAR = 0.35  # rad: a turn beyond it is left to votes that agree with each other (`starting.starts`)
 
 
@@ -62,7 +62,8 @@ def settle(m: Memory, w: Work, log: Columns, j: int, vote: Array) -> int:
     r, whole = w.residual, (2.0 * vote[VOTE_ACROSS] + vote[VOTE_ALONG]) / 3.0
     turn = (r[0] * r[0] + r[1] * r[1] + r[2] * r[2]) / vote[VOTE_TURN]
     place = (r[3] * r[3] + r[4] * r[4] + r[5] * r[5]) / whole
-    if turn <= FAR_OFF * m.limits[LIMIT_ROTATION] and place <= FAR_OFF * m.limits[LIMIT_POSITION]:
+    far = FAR_OFF if log.kinds[j] == OBJECT_POSE else 1.0
+    if turn <= far * m.limits[LIMIT_ROTATION] and place <= far * m.limits[LIMIT_POSITION]:
         r[:] = 0.0
     _correct(m, w, 0, 6, count)
     return ACCEPTED

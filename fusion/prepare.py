@@ -90,7 +90,8 @@ def pose_problem(
         measured = camera_measurements(poses, calibration, options, lasting_s)
     else:
         if log.landmark_map is None:
-            raise InputError("there is no landmarks.json", path=log.path, fix="fuse camera poses instead (--measurements camera)")
+            fix = "fuse camera poses instead (--measurements camera)"
+            raise InputError("there is no landmarks.json", path=log.path, fix=fix)
         detections = object_poses if object_poses is not None else log.detections(None)[1]
         measured = object_measurements(detections, log.landmark_map, calibration, options, log.path)
     refuse_other_units(measured.stamps_ns, FASTEST_CAMERA_HZ, log.path)

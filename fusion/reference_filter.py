@@ -218,7 +218,7 @@ class ReferenceFilter:
             return REJECTED
         whole = np.repeat([vote[VOTE_TURN], (2.0 * vote[VOTE_ACROSS] + vote[VOTE_ALONG]) / 3.0], 3)
         turn, place = np.add.reduceat(residual**2 / whole, [0, 3])
-        limits = filter_update.FAR_OFF * self.m.limits
+        limits = self.m.limits * (filter_update.FAR_OFF if log.kinds[j] == OBJECT_POSE else 1.0)
         off = turn > limits[filter_update.LIMIT_ROTATION] or place > limits[filter_update.LIMIT_POSITION]
         self.correct(residual if off else 0.0 * residual, H, R)
         return ACCEPTED
