@@ -182,8 +182,7 @@ def frames_to_compare(truth_ns: Stamps, sensor_ns: Stamps, options: EvaluateOpti
     """Return the stamps to compare at: the ground truth's own, where its frames are the sensor's.
 
     Where it ticks faster than the sensor or beside it (motion capture), the sensor's stamps, each once; what the sensor
-    then missed altogether is nobody's frame, so pass every image's stamp where the log has them (frames.csv). But where
-    it ticks so slowly that nothing is interpolated between its poses, its own again: what is fused has poses there.
+    then missed altogether is nobody's frame, so pass every image's stamp where the log has them (frames.csv).
     """
     options = options or EvaluateOptions()
     sensor_ns = np.unique(sensor_ns)
@@ -193,8 +192,7 @@ def frames_to_compare(truth_ns: Stamps, sensor_ns: Stamps, options: EvaluateOpti
     shared = np.mean(apart <= options.max_offset_s * 1e9) > 0.5
     # a low percentile, since the sensor misses frames
     faster = np.percentile(np.diff(sensor_ns), 5) > 1.5 * np.median(np.diff(truth_ns))
-    sparse = np.median(np.diff(truth_ns)) > options.max_gap_s * 1e9
-    return truth_ns if (shared or sparse) and not faster else sensor_ns
+    return truth_ns if shared and not faster else sensor_ns
 
 
 def pool(evaluations: Iterable[Evaluation]) -> Evaluation:

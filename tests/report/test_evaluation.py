@@ -180,16 +180,6 @@ def test_truth_that_ticks_otherwise_is_compared_at_the_sensors_frames() -> None:
     assert frames_to_compare(CAMERA.stamps_ns, missing) is CAMERA.stamps_ns
 
 
-@pytest.mark.parametrize("rate_hz", [1.0, 7.0, 30.0])
-def test_truth_too_sparse_to_interpolate_is_compared_at_its_own_stamps(rate_hz: float) -> None:
-    truth, sensor_ns = motion(stamps(rate_hz, round(2 * rate_hz), offset_s=0.0037)), stamps(30.0, 60)
-    frames_ns = frames_to_compare(truth.stamps_ns, sensor_ns)
-    assert frames_ns is truth.stamps_ns
-    fused = motion(stamps(200.0, 400))
-    row = evaluate([cam("a", fused)], {"cam": truth}, EVERYTHING, frame_stamps_ns=frames_ns)["a"]
-    assert row.coverage > 0.9
-
-
 def test_the_other_bodys_truth_follows_from_the_extrinsics() -> None:
     T_cam_imu = RigidTransform.from_exp_coords([0.1, 0.2, 0.3, 1.0, 2.0, 3.0])
     imu = references_for_both_bodies({"cam": CAMERA}, T_cam_imu)["imu"]
