@@ -102,7 +102,10 @@ class Result:
             return text + ", no ground truth>"
         errors = to_summary(self.evaluation)[self.name]
         position, attitude = errors["position_error_mm"]["norm"]["rmse"], errors["attitude_error_deg"]["angle"]["rmse"]
-        return text + (">" if position is None else f", RMSE {position:.1f} mm, {attitude:.2f} deg>")
+        if position is None:
+            why = self.evaluation[self.name].why_none
+            return text + (f", no errors: {why}>" if why else ">")
+        return text + f", RMSE {position:.1f} mm, {attitude:.2f} deg>"
 
 
 @dataclass(frozen=True, repr=False)

@@ -18,6 +18,7 @@ from scipy.spatial.transform import Rotation
 import poet_loc
 from fusion.fuse import fuse as fuse_stage
 from fusion.simulate import SimulationOptions, simulate
+from poet_loc.core.trajectory import Trajectory
 from poet_loc.io.log_folder import write_log
 from poet_loc.io.tum import read_tum
 from poet_loc.report.html import table_html
@@ -65,6 +66,16 @@ def page_sources(html: str) -> list[str]:
     assert "@import" not in html
     assert "url(" not in html
     return parser.fetched
+
+
+def test_sparse_truth_is_compared_where_there_are_poses_and_else_it_is_said_why(log):
+    stamps_ns = np.arange(log.T_world_cam.stamps_ns[0] + 3_700_000, log.T_world_cam.stamps_ns[-1], 130_000_000)
+    sparse = Trajectory(stamps_ns, log.T_world_cam.interpolate(stamps_ns)[0])
+    log = replace(log, T_world_cam=sparse, T_world_imu=None)
+    localized, fused = poet_loc.localize(log), poet_loc.fuse(log)
+    assert "no errors: its poses (30.0 Hz) share no stamp with T_world_cam.tum (7.7 Hz)" in repr(localized)
+    assert "RMSE" in repr(fused)
+    assert fused.evaluation["fuse/eskf/objects"].coverage > 0.9
 
 
 def test_import_is_light_and_names_are_there():

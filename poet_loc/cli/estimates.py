@@ -192,6 +192,9 @@ def evaluate_estimates(
     missing = {estimate.body for estimate in estimates} - references_of(log).keys()
     if missing:
         report.note(f"{log.path}: no T_world_{missing.pop()}.tum and no extrinsics: no errors of what follows it")
+    for reason in dict.fromkeys(row.why_none for row in evaluation.rows if row.why_none):
+        names = ", ".join(row.name for row in evaluation.rows if row.why_none == reason)
+        report.note(f"{log.path}: no errors of {names}: {reason}")
     return evaluation
 
 

@@ -25,6 +25,8 @@ Body = Literal["cam", "imu"]
 ERROR_AXES = ("x", "y", "z", "yaw", "pitch", "roll")
 """The columns of `Row.errors` and `Row.sigmas`: m in world axes, rad as `core.errors.attitude_error` defines them."""
 
+_BY_CHANCE = 0.2  # clocks that only beat, or jitter, meet more seldom: mostly 1 ms in more than 25 ms
+
 
 @dataclass(frozen=True)
 class Estimate:
@@ -95,6 +97,8 @@ class Row:
     """(n,) pose NEES per degree of freedom; NaN where the estimate brings no covariance."""
     on_common: Mask
     """(n,) whether every row of the comparison covers the frame."""
+    why_none: str = ""
+    """Why no frame could be compared, although it has poses; empty where some were."""
 
     @property
     def coverage(self) -> float:
@@ -140,12 +144,13 @@ def evaluate(
     sensor_span_ns: tuple[int, int],
     options: EvaluateOptions | None = None,
     frame_stamps_ns: Stamps | None = None,
+    frames_of: str = "the ground truth",
 ) -> Evaluation:
     """Compare estimates with the ground truth of their own bodies at the frames within the sensor's span.
 
     The frames are the ground truth's stamps (the camera's, else the IMU's), or frame_stamps_ns where ground truth and
-    camera tick differently: it is interpolated there by the same rule as the estimates.  A row without any estimate
-    takes no part in the common frames; its coverage is 0.
+    camera tick differently: it is interpolated there by the same rule as the estimates; frames_of names whose stamps
+    they are.  A row without any estimate takes no part in the common frames; its coverage is 0.
     Raises InputError if no frame lies within the span, ValueError for a body without ground truth or a name twice.
     """
     options = options or EvaluateOptions()
@@ -166,6 +171,10 @@ def evaluate(
         if estimate.body not in references:
             raise ValueError(f"{estimate.name} follows the {estimate.body}, for which there is no ground truth")
         row, covers = _row(estimate, frames_ns, *truths[estimate.body], options)
+        if len(estimate.trajectory) and not covers.any():
+            missing = estimate.trajectory if row.frames_in_span else references[estimate.body]
+            whose = "its" if row.frames_in_span else "the ground truth's"
+            row = replace(row, why_none=_why_none(whose, missing.stamps_ns, frames_ns, frames_of, options))
         rows.append(row)
         covered.append(covers)
     common = np.all([covers for covers in covered if covers.any()], axis=0)  # all of nothing is one True
@@ -182,17 +191,26 @@ def frames_to_compare(truth_ns: Stamps, sensor_ns: Stamps, options: EvaluateOpti
     """Return the stamps to compare at: the ground truth's own, where its frames are the sensor's.
 
     Where it ticks faster than the sensor or beside it (motion capture), the sensor's stamps, each once; what the sensor
-    then missed altogether is nobody's frame, so pass every image's stamp where the log has them (frames.csv).
+    then missed altogether is nobody's frame, so where the log has every image's stamp (frames.csv), compare there.
+    Truth that is too sparse for the sensor's stamps is compared at its own: a trajectory at an IMU's rate has poses
+    there.
     """
     options = options or EvaluateOptions()
     sensor_ns = np.unique(sensor_ns)
     if len(sensor_ns) < 2 or len(truth_ns) < 2:
         return truth_ns
-    apart = np.abs(truth_ns[nearest_stamps(sensor_ns, truth_ns)] - sensor_ns)
-    shared = np.mean(apart <= options.max_offset_s * 1e9) > 0.5
+    if too_sparse(truth_ns, sensor_ns, options):
+        return truth_ns
+    shared = np.mean(_near(truth_ns, sensor_ns, options)) > 0.5
     # a low percentile, since the sensor misses frames
-    faster = np.percentile(np.diff(sensor_ns), 5) > 1.5 * np.median(np.diff(truth_ns))
+    faster = np.percentile(np.diff(sensor_ns), 5) > 1.5 * _interval_ns(truth_ns)
     return truth_ns if shared and not faster else sensor_ns
+
+
+def too_sparse(truth_ns: Stamps, frames_ns: Stamps, options: EvaluateOptions) -> bool:
+    """Return whether the truth has poses among the frames, but none at them nor near enough to be interpolated."""
+    among = (truth_ns >= frames_ns.min()) & (truth_ns <= frames_ns.max())
+    return bool(among.any() and _only_beats(truth_ns, frames_ns, options))
 
 
 def pool(evaluations: Iterable[Evaluation]) -> Evaluation:
@@ -266,14 +284,54 @@ def _row(
 
 def _poses_at(trajectory: Trajectory, frames_ns: Stamps, options: EvaluateOptions) -> tuple[RigidTransform, Mask]:
     """The poses at the frames, interpolated where neighbours are near, and which frames have one."""
-    interval_ns = np.median(np.diff(frames_ns)) if len(frames_ns) > 1 else np.inf
-    max_gap_ns = min(options.max_gap_s * 1e9, 1.5 * interval_ns)
-    interpolated, between = trajectory.interpolate(frames_ns, int(max_gap_ns))
+    interpolated, between = trajectory.interpolate(frames_ns, int(_max_gap_ns(frames_ns, options)))
     nearest = nearest_stamps(frames_ns, trajectory.stamps_ns)
-    near = np.abs(trajectory.stamps_ns[nearest] - frames_ns) <= options.max_offset_s * 1e9
+    near = _near(trajectory.stamps_ns, frames_ns, options)
     both = RigidTransform.concatenate([interpolated, trajectory.T_world_body[nearest]])
     index = np.arange(len(frames_ns))
-    return both[np.where(between, index, index + len(frames_ns))], between | near
+    covers = (between | near) & (not _only_beats(trajectory.stamps_ns, frames_ns, options))
+    return both[np.where(between, index, index + len(frames_ns))], covers
+
+
+def _interval_ns(stamps_ns: Stamps) -> float:
+    """The usual time between stamps; infinite for a single one."""
+    return float(np.median(np.diff(stamps_ns))) if len(stamps_ns) > 1 else np.inf
+
+
+def _max_gap_ns(frames_ns: Stamps, options: EvaluateOptions) -> float:
+    """The longest gap over which a trajectory is interpolated at the frames."""
+    return min(options.max_gap_s * 1e9, 1.5 * _interval_ns(frames_ns))
+
+
+def _near(stamps_ns: Stamps, frames_ns: Stamps, options: EvaluateOptions) -> Mask:
+    """Which frames have a stamp near, (F,)."""
+    apart_ns = np.abs(stamps_ns[nearest_stamps(frames_ns, stamps_ns)] - frames_ns)
+    return np.asarray(apart_ns <= options.max_offset_s * 1e9)
+
+
+def _only_beats(stamps_ns: Stamps, frames_ns: Stamps, options: EvaluateOptions) -> bool:
+    """Whether stamps too sparse for the frames meet no more of them than chance would have it."""
+    start_ns, end_ns = max(stamps_ns[0], frames_ns[0]), min(stamps_ns[-1], frames_ns[-1])
+    could = min(np.count_nonzero((each >= start_ns) & (each <= end_ns)) for each in (stamps_ns, frames_ns))
+    met = np.count_nonzero(_near(stamps_ns, frames_ns, options))
+    sparse = _interval_ns(stamps_ns) > _max_gap_ns(frames_ns, options)
+    return sparse and bool(met <= _BY_CHANCE * could)
+
+
+def _why_none(whose: str, stamps_ns: Stamps, frames_ns: Stamps, frames_of: str, options: EvaluateOptions) -> str:
+    """Say why none of a trajectory's poses counts at any frame."""
+    shared = f"share no stamp with {frames_of}{_rate(frames_ns)} to {1e3 * options.max_offset_s:g} ms"
+    why = f"{whose} poses{_rate(stamps_ns)} {shared}"
+    if stamps_ns[-1] < frames_ns[0] or stamps_ns[0] > frames_ns[-1]:
+        return f"{whose} poses share no time with {frames_of}"
+    interval_ns, limit_ns = _interval_ns(stamps_ns), _max_gap_ns(frames_ns, options)
+    if limit_ns < interval_ns < np.inf:
+        why += f" and are too sparse to interpolate ({interval_ns * 1e-9:.3f} s > {limit_ns * 1e-9:.3f} s)"
+    return why
+
+
+def _rate(stamps_ns: Stamps) -> str:
+    return f" ({1e9 / _interval_ns(stamps_ns):.1f} Hz)" if len(stamps_ns) > 1 else ""
 
 
 def _covariances_at(estimate: Estimate, stamps_ns: Stamps) -> Array | None:

@@ -16,6 +16,7 @@ from poet_loc.report.evaluate import (
     evaluate,
     frames_to_compare,
     references_for_both_bodies,
+    too_sparse,
 )
 
 
@@ -44,5 +45,18 @@ def evaluate_log(
     assert source is not None
     sensor_ns = np.asarray(source.stamps_ns)
     truth_ns = references["cam" if "cam" in references else "imu"].stamps_ns
-    frames_ns = frames_to_compare(truth_ns, sensor_ns) if log.frames is None else log.frames.stamps_ns
-    return evaluate(known, references, (int(sensor_ns.min()), int(sensor_ns.max())), options, frames_ns)
+    if log.frames is None:
+        frames_ns, frames_of = frames_to_compare(truth_ns, sensor_ns, options), _file_of(detections)
+    else:
+        frames_ns, frames_of = log.frames.stamps_ns, "frames.csv"
+        frames_ns = truth_ns if too_sparse(truth_ns, frames_ns, options) else frames_ns
+    if frames_ns is truth_ns:
+        frames_of = "T_world_imu.tum" if log.T_world_cam is None else "T_world_cam.tum"
+    span_ns = (int(sensor_ns.min()), int(sensor_ns.max()))
+    return evaluate(known, references, span_ns, options, frames_ns, frames_of)
+
+
+def _file_of(detections: str | None) -> str:
+    if detections is None:
+        return "camera_poses.csv"
+    return f"object_poses_{detections}.csv" if detections else "object_poses.csv"

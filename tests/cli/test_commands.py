@@ -18,11 +18,12 @@ from fusion.simulate import SimulationOptions, simulate
 from poet_loc.cli import run as run_command
 from poet_loc.cli import view as view_command
 from poet_loc.cli.main import main
+from poet_loc.core.trajectory import Trajectory
 from poet_loc.io.calibration_yaml import read_calibration
 from poet_loc.io.camera_poses_csv import read_camera_poses, write_camera_poses
 from poet_loc.io.landmarks_json import read_landmarks
 from poet_loc.io.log_folder import read_log
-from poet_loc.io.tum import read_tum
+from poet_loc.io.tum import read_tum, write_tum
 
 MODES = ("all", "out", "prev", "best", "robust")
 FILES = {
@@ -427,3 +428,18 @@ def test_fuse_names_an_object_that_was_moved_and_takes_odometry_beside_the_imu(t
     assert [each["object_id"] for each in health["released"]] == [2]
     assert [each["released"] for each in health["objects"]] == [False, True, False, False]
     assert health["share_of_time"]["tracking"] > 0.9
+
+
+def test_what_cannot_be_compared_is_told_in_one_line(log, tmp_path, capsys):
+    truth = read_tum(log / "T_world_cam.tum")
+    stamps_ns = np.arange(truth.stamps_ns[0] + 3_700_000, truth.stamps_ns[-1], 130_000_000)
+    write_tum(log / "T_world_cam.tum", Trajectory(stamps_ns, truth.interpolate(stamps_ns)[0]))
+    (log / "T_world_imu.tum").unlink()
+    assert main(["run", str(log), "--out", str(tmp_path / "run"), "--no-pictures"]) == 0
+    told = [line for line in capsys.readouterr().err.splitlines() if "no errors of" in line]
+    assert len(told) == 1
+    assert "localize/all, localize/out" in told[0]
+    assert "to 0.5 ms and are too sparse to interpolate (0.033 s > 0.025 s)" in told[0]
+    rows = summary(tmp_path / "run")
+    assert rows["fuse/eskf/objects"]["coverage"] > 0.9
+    assert rows["fuse/eskf/objects"]["on_common_frames"]["frames"] > 50

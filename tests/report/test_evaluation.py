@@ -180,6 +180,51 @@ def test_truth_that_ticks_otherwise_is_compared_at_the_sensors_frames() -> None:
     assert frames_to_compare(CAMERA.stamps_ns, missing) is CAMERA.stamps_ns
 
 
+@pytest.mark.parametrize(
+    ("truth_hz", "sensor_hz"), [(1.0, 30.0), (7.7, 10.0), (30.0, 30.0), (30.0, 10.0), (60.0, 100.0)]
+)
+def test_truth_too_sparse_for_the_sensors_stamps_is_compared_at_its_own(truth_hz: float, sensor_hz: float) -> None:
+    truth = motion(stamps(truth_hz, round(2 * truth_hz), offset_s=0.0047))
+    sensor_ns = stamps(sensor_hz, round(2 * sensor_hz))
+    assert frames_to_compare(truth.stamps_ns, sensor_ns) is truth.stamps_ns
+    rows = evaluate([cam("fused", motion(stamps(200.0, 400)))], {"cam": truth}, EVERYTHING)
+    assert rows["fused"].coverage > 0.9
+    assert not rows["fused"].why_none
+
+
+def test_sparse_truth_is_compared_at_the_sensors_stamps_where_it_has_poses_there() -> None:
+    every_third = CAMERA[::3]
+    frames_ns = frames_to_compare(every_third.stamps_ns, CAMERA.stamps_ns)
+    row = evaluate([cam("a", CAMERA)], {"cam": every_third}, EVERYTHING, frame_stamps_ns=frames_ns)["a"]
+    assert (row.coverage, len(row.stamps_ns)) == (1.0, 20)
+    # wide enough a gap to interpolate over
+    slow, wide = motion(stamps(20.0, 40, offset_s=0.0037)), EvaluateOptions(max_gap_s=0.1)
+    assert frames_to_compare(slow.stamps_ns, stamps(15.0, 30), wide).tolist() == stamps(15.0, 30).tolist()
+
+
+def test_clocks_that_only_beat_share_no_frame_and_it_is_said_why() -> None:
+    truth, sensor = motion(stamps(7.7, 77)), motion(stamps(10.0, 100))  # they meet at 0 s
+    fused = motion(stamps(200.0, 2000))
+    evaluation = evaluate([cam("given", sensor), cam("fused", fused)], {"cam": truth}, EVERYTHING)
+    assert evaluation["given"].coverage == 0.0
+    assert evaluation["given"].why_none == (
+        "its poses (10.0 Hz) share no stamp with the ground truth (7.7 Hz) to 0.5 ms "
+        "and are too sparse to interpolate (0.100 s > 0.025 s)"
+    )
+    assert evaluation["fused"].on_common.sum() == len(truth)
+
+
+def test_where_the_truth_is_missing_it_is_said_why() -> None:
+    sparse, frames_ns = motion(stamps(20.0, 40, offset_s=0.0037)), CAMERA.stamps_ns
+    row = evaluate([cam("a", CAMERA)], {"cam": sparse}, EVERYTHING, None, frames_ns, "frames.csv")["a"]
+    assert row.why_none.startswith("the ground truth's poses (20.0 Hz) share no stamp with frames.csv (30.0 Hz)")
+    later = motion(stamps(100.0, 40, offset_s=1e3))
+    assert frames_to_compare(later.stamps_ns, frames_ns).tolist() == frames_ns.tolist()
+    row = evaluate([cam("a", CAMERA)], {"cam": later}, EVERYTHING, None, frames_ns, "frames.csv")["a"]
+    assert row.why_none == "the ground truth's poses share no time with frames.csv"
+    assert evaluate([cam("a", CAMERA[:0])], {"cam": CAMERA}, EVERYTHING)["a"].why_none == ""
+
+
 def test_the_other_bodys_truth_follows_from_the_extrinsics() -> None:
     T_cam_imu = RigidTransform.from_exp_coords([0.1, 0.2, 0.3, 1.0, 2.0, 3.0])
     imu = references_for_both_bodies({"cam": CAMERA}, T_cam_imu)["imu"]
