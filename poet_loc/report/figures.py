@@ -175,7 +175,7 @@ def top_view_figure(record: RunRecord) -> Figure:
         panel.set_xlabel("x [m]")
         panel.set_title(f"{_BODY_NAMES[body]} (circle: start, square: end)", loc="left")
     axes[0, 0].set_ylabel("y [m]")
-    figure.suptitle("From above, with the landmarks as diamonds", fontsize=9)
+    figure.suptitle("From above, with the landmarks as diamonds" if record.landmark_map else "From above", fontsize=9)
     handles: dict[str, Any] = {}
     for panel in axes[0]:
         handles |= {text: handle for handle, text in zip(*panel.get_legend_handles_labels(), strict=True)}
@@ -202,7 +202,8 @@ def consistency_figure(row: Row, gate: Gates | None = None, start_ns: int = 0) -
         for panel, (part, nis, accepted) in zip(axes[1:, 0], parts, strict=True):
             for keep, colour, text in ((accepted, BLUE, "accepted"), (~accepted, VERMILLION, "refused")):
                 panel.plot(at[keep], nis[keep] / 3.0, color=colour, label=text, **_dots(len(nis)))
-            share = 100.0 * accepted.mean() if len(accepted) else float("nan")
+            asked = np.isfinite(nis)  # before the start no pose is asked
+            share = 100.0 * accepted[asked].mean() if asked.any() else float("nan")
             panel.set_title(f"NIS of {part} per degree of freedom: {share:.1f} % accepted", loc="left")
             _draw_bounds(panel, 3)
     for panel in axes[:, 0]:
@@ -219,7 +220,7 @@ def consistency_figure(row: Row, gate: Gates | None = None, start_ns: int = 0) -
 
 @styled
 def landmark_figure(record: RunRecord, decisions: Decisions, name: str) -> Figure:
-    """Return a lane for each landmark: when it was seen, and what the estimator made of it."""
+    """Return a lane for each landmark, or one for camera poses: when it was seen, and what the estimator made of it."""
     lanes = decisions.lanes()
     figure, axes = new_figure(1, 1, 0.9 + 0.26 * len(lanes))
     panel = axes[0, 0]
@@ -240,7 +241,9 @@ def landmark_figure(record: RunRecord, decisions: Decisions, name: str) -> Figur
     panel.set_ylim(len(lanes) - 0.5, -0.5)
     panel.grid(axis="y", visible=False)
     panel.set_xlabel(_TIME)
-    figure.suptitle(f"{name}: which landmark was seen when, and used or refused", fontsize=9)
+    of_landmarks = any(object_id >= 0 for object_id, _ in lanes)
+    title = "which landmark was seen when, and used or refused" if of_landmarks else "camera poses, used or refused"
+    figure.suptitle(f"{name}: {title}", fontsize=9)
     legend_below(figure, panel)
     return figure
 

@@ -53,7 +53,10 @@ class RunRecord:
         if self.detections is not None:
             for name, voted in self.voted.items():
                 found[name] = Decisions.of_votes(self.detections, voted)
-        return found | {fused.name: Decisions.of_gate(fused.gate) for fused in self.fused if fused.gate is not None}
+        for fused in self.fused:
+            if fused.gate is not None:
+                found[fused.name] = Decisions.of_gate(fused.gate, int(fused.stamps_ns[0]))
+        return found
 
     def landmark_label(self, object_id: int, instance: int) -> str:
         """Return a landmark's name, or its id where it has none; a negative id stands for a whole camera pose."""
@@ -82,11 +85,15 @@ class Decisions:
         return cls(detections.stamps_ns, keys, np.where(voted, ACCEPTED, REFUSED))
 
     @classmethod
-    def of_gate(cls, gate: Gates) -> Decisions:
-        """Return the decisions of a filter, which accepts position and rotation each by itself."""
+    def of_gate(cls, gate: Gates, start_ns: int) -> Decisions:
+        """Return the decisions of a filter, which accepts position and rotation each by itself, since its start.
+
+        The poses until then made the start: nothing was decided about them.
+        """
+        since = gate.stamps_ns > start_ns
         keys = np.stack([gate.object_ids, gate.instances], axis=1)
         decisions = POSITION_ONLY * gate.position_accepted + ROTATION_ONLY * gate.rotation_accepted
-        return cls(gate.stamps_ns, keys, decisions.astype(np.int64))
+        return cls(gate.stamps_ns[since], keys[since], decisions[since].astype(np.int64))
 
     def lanes(self) -> dict[tuple[int, int], tuple[Stamps, NDArray[np.int64]]]:
         """Return stamps and decisions of each landmark, by its key in ascending order."""

@@ -20,6 +20,7 @@ from poet_loc.report import figure_style
 from poet_loc.report import figures as figures_module
 from poet_loc.report.evaluate import ERROR_AXES
 from poet_loc.report.figures import (
+    consistency_figure,
     draw_run,
     error_figure,
     landmark_figure,
@@ -179,16 +180,37 @@ def test_decisions_of_gate_and_votes(run_record: RunRecord) -> None:
     gate = run_record.fused[0].gate
     assert gate is not None
     found = run_record.decisions["fuse/eskf/objects"].decisions
-    both = gate.position_accepted & gate.rotation_accepted
-    neither = ~gate.position_accepted & ~gate.rotation_accepted
+    since = gate.stamps_ns > run_record.fused[0].stamps_ns[0]
+    assert 0 < len(found) == since.sum() < len(since), "what made the start was not refused"
+    position, rotation = gate.position_accepted[since], gate.rotation_accepted[since]
+    both, neither = position & rotation, ~position & ~rotation
     assert (found[both] == ACCEPTED).all()
     assert (found[neither] == REFUSED).all()
-    assert (found[gate.position_accepted & ~both] == POSITION_ONLY).all()
-    assert (found[gate.rotation_accepted & ~both] == ROTATION_ONLY).all()
+    assert (found[position & ~both] == POSITION_ONLY).all()
+    assert (found[rotation & ~both] == ROTATION_ONLY).all()
     lanes = run_record.decisions["localize/robust"].lanes()
     assert list(lanes) == [(3, 0), (9, 1)]
     assert sum(len(stamps) for stamps, _ in lanes.values()) == 240
     assert [run_record.landmark_label(*key) for key in lanes] == ["004_sugar_box", "object 9 #1"]
+
+
+def test_no_title_speaks_of_landmarks_where_there_are_none(run_record: RunRecord) -> None:
+    fused = run_record.fused[0]
+    gate = replace(fused.gate, object_ids=np.full_like(fused.gate.object_ids, -1))
+    of_poses = replace(run_record, fused=(replace(fused, gate=gate),), landmark_map=None, detections=None, voted={})
+    for record, spoken in ((run_record, True), (of_poses, False)):
+        figures = [top_view_figure(record), landmark_figure(record, record.decisions[fused.name], fused.name)]
+        assert ["landmark" in figure.get_suptitle() for figure in figures] == [spoken, spoken]
+
+
+def test_the_share_accepted_is_of_the_poses_that_were_asked(run_record: RunRecord) -> None:
+    gate, row = run_record.fused[0].gate, run_record.evaluation["fuse/eskf/objects"]
+    late = np.arange(len(gate.stamps_ns)) >= 60
+    asked = replace(
+        gate, nis_position=np.where(late, gate.nis_position, np.nan), position_accepted=late & gate.position_accepted
+    )
+    title = consistency_figure(row, asked).axes[1].get_title("left")
+    assert f"{100 * gate.position_accepted[late].mean():.1f} % accepted" in title
 
 
 def test_lanes_cover_the_time_that_was_seen(figures: dict[str, Figure]) -> None:
