@@ -78,6 +78,27 @@ def test_sparse_truth_is_compared_where_there_are_poses_and_else_it_is_said_why(
     assert fused.evaluation["fuse/eskf/objects"].coverage > 0.9
 
 
+def test_errors_where_the_sensor_saw_nothing_count_and_the_table_says_where_it_was_compared(log):
+    truth, detections = log.T_world_cam, log.object_poses[""]
+    stamps_ns = np.arange(truth.stamps_ns[0], truth.stamps_ns[-1], 10_000_000)
+    dense = Trajectory(stamps_ns, truth.interpolate(stamps_ns)[0])
+    seconds = (detections.stamps_ns - stamps_ns[0]) * 1e-9
+    seen = (seconds < 3.0) | (seconds > 5.0)
+    fast = replace(log, T_world_cam=dense, T_world_imu=None, frames=None)
+    fused = poet_loc.fuse(replace(fast, object_poses={"": detections[seen]}))
+    row = fused.evaluation["fuse/eskf/objects"]
+    in_gap = np.abs((row.stamps_ns - stamps_ns[0]) * 1e-9 - 4.0) < 0.9
+    assert in_gap.sum() == pytest.approx(54, abs=2)
+    errors = np.linalg.norm(row.errors[:, :3], axis=1)
+    assert errors[in_gap].mean() > 2.0 * errors[~in_gap].mean()
+    files = "object_poses.csv and, in its long gaps, T_world_cam.tum"
+    told = f"Compared with ground truth at {row.frames_in_span} stamps, those of {files};"
+    assert told in fused._repr_html_()
+    assert f"{row.frames_in_span} stamps, those of T_world_cam.tum;" not in fused._repr_html_()
+    whole = poet_loc.evaluate(poet_loc.fuse(fast)).tables[0].notes
+    assert any("stamps, those of object_poses.csv; errors elsewhere do not count." in note for note in whole)
+
+
 def test_import_is_light_and_names_are_there():
     code = "import sys, poet_loc; print(*sys.modules); [getattr(poet_loc, name) for name in poet_loc.__all__]"
     loaded = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout.split()

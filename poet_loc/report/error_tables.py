@@ -207,11 +207,20 @@ def _notes(blocks: Sequence[Block]) -> Iterator[str]:
         "Mean ± std of the absolute error per axis; median, p95 and RMSE of the norm and of the angle. "
         "Position in world axes, attitude as z-y-x angles of R_ref^T R_est, no alignment."
     )
-    counts = {max(row["on_common_frames"]["frames"] for row in block.summary.values()) for block in blocks}
-    frames = " to ".join(str(count) for count in dict.fromkeys([min(counts), max(counts)]))
+    rows = [row for block in blocks for row in block.summary.values()]
+    frames = _span(max(row["on_common_frames"]["frames"] for row in block.summary.values()) for block in blocks)
     yield f"Common frames, which every row of a block covers: {frames}. Own frames: all that a row covers."
-    if any(row.get("oracle") for block in blocks for row in block.summary.values()):
+    if files := dict.fromkeys(row["compared_at"] for row in rows if "compared_at" in row):
+        span = _span(row["frames_in_span"] for row in rows if "compared_at" in row)
+        stamps = f"{span} stamps, those of {' or '.join(files)}"
+        yield f"Compared with ground truth at {stamps}; errors elsewhere do not count."
+    if any(row.get("oracle") for row in rows):
         yield "An oracle chooses by the ground truth: it is no competitor."
+
+
+def _span(counts: Iterable[int]) -> str:
+    counts = list(counts)
+    return " to ".join(str(count) for count in dict.fromkeys([min(counts), max(counts)]))
 
 
 def _rows_per_axis(summary: ErrorSummary) -> Iterator[tuple[str, ...]]:

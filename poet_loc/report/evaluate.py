@@ -27,6 +27,8 @@ ERROR_AXES = ("x", "y", "z", "yaw", "pitch", "roll")
 
 _BY_CHANCE = 0.2  # clocks that only beat, or jitter, meet more seldom: mostly 1 ms in more than 25 ms
 
+_LONG_GAP = 10  # intervals of the sensor; it misses frames now and then
+
 
 @dataclass(frozen=True)
 class Estimate:
@@ -97,6 +99,8 @@ class Row:
     """(n,) pose NEES per degree of freedom; NaN where the estimate brings no covariance."""
     on_common: Mask
     """(n,) whether every row of the comparison covers the frame."""
+    frames_of: str = "the ground truth"
+    """Whose stamps the frames are."""
     why_none: str = ""
     """Why no frame could be compared, although it has poses; empty where some were."""
 
@@ -171,6 +175,7 @@ def evaluate(
         if estimate.body not in references:
             raise ValueError(f"{estimate.name} follows the {estimate.body}, for which there is no ground truth")
         row, covers = _row(estimate, frames_ns, *truths[estimate.body], options)
+        row = replace(row, frames_of=frames_of)
         if len(estimate.trajectory) and not covers.any():
             missing = estimate.trajectory if row.frames_in_span else references[estimate.body]
             whose = "its" if row.frames_in_span else "the ground truth's"
@@ -191,7 +196,8 @@ def frames_to_compare(truth_ns: Stamps, sensor_ns: Stamps, options: EvaluateOpti
     """Return the stamps to compare at: the ground truth's own, where its frames are the sensor's.
 
     Where it ticks faster than the sensor or beside it (motion capture), the sensor's stamps, each once; what the sensor
-    then missed altogether is nobody's frame, so where the log has every image's stamp (frames.csv), compare there.
+    then missed altogether is nobody's frame, so where the log has every image's stamp (frames.csv), compare there, else
+    also at the `stamps_in_gaps`.
     Truth that is too sparse for the sensor's stamps is compared at its own: a trajectory at an IMU's rate has poses
     there.
     """
@@ -205,6 +211,17 @@ def frames_to_compare(truth_ns: Stamps, sensor_ns: Stamps, options: EvaluateOpti
     # a low percentile, since the sensor misses frames
     faster = np.percentile(np.diff(sensor_ns), 5) > 1.5 * _interval_ns(truth_ns)
     return truth_ns if shared and not faster else sensor_ns
+
+
+def stamps_in_gaps(truth_ns: Stamps, sensor_ns: Stamps) -> Stamps:
+    """Return stamps of the ground truth where the sensor had none for long, about as often as it has them elsewhere."""
+    sensor_ns = np.unique(sensor_ns)
+    interval_ns = _interval_ns(sensor_ns)
+    gaps = np.flatnonzero(np.diff(sensor_ns) > _LONG_GAP * interval_ns)
+    ticks = [np.arange(sensor_ns[i] + interval_ns, sensor_ns[i + 1] - interval_ns / 2, interval_ns) for i in gaps]
+    wanted = np.concatenate([np.empty(0), *ticks]).astype(np.int64)
+    found = truth_ns[nearest_stamps(wanted, truth_ns)]
+    return np.unique(found[np.abs(found - wanted) <= interval_ns / 2])
 
 
 def too_sparse(truth_ns: Stamps, frames_ns: Stamps, options: EvaluateOptions) -> bool:
@@ -354,6 +371,7 @@ def _concatenated(parts: Sequence[Row]) -> Row:
         parts[0],
         runtime_s=sum(runtimes) if runtimes else None,
         frames_in_span=sum(part.frames_in_span for part in parts),
+        frames_of=" or ".join(dict.fromkeys(part.frames_of for part in parts)),
         stamps_ns=np.concatenate([part.stamps_ns for part in parts]),
         errors=np.concatenate([part.errors for part in parts]),
         angles=np.concatenate([part.angles for part in parts]),

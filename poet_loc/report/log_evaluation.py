@@ -16,6 +16,7 @@ from poet_loc.report.evaluate import (
     evaluate,
     frames_to_compare,
     references_for_both_bodies,
+    stamps_in_gaps,
     too_sparse,
 )
 
@@ -50,8 +51,11 @@ def evaluate_log(
     else:
         frames_ns, frames_of = log.frames.stamps_ns, "frames.csv"
         frames_ns = truth_ns if too_sparse(truth_ns, frames_ns, options) else frames_ns
+    truth_file = "T_world_imu.tum" if log.T_world_cam is None else "T_world_cam.tum"
     if frames_ns is truth_ns:
-        frames_of = "T_world_imu.tum" if log.T_world_cam is None else "T_world_cam.tum"
+        frames_of = truth_file
+    elif log.frames is None and len(missed_ns := stamps_in_gaps(truth_ns, sensor_ns)):
+        frames_ns, frames_of = np.union1d(frames_ns, missed_ns), f"{frames_of} and, in its long gaps, {truth_file}"
     span_ns = (int(sensor_ns.min()), int(sensor_ns.max()))
     return evaluate(known, references, span_ns, options, frames_ns, frames_of)
 

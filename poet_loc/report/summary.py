@@ -43,6 +43,8 @@ class RowSummary(ErrorSummary):
     """What summary.json holds for one row; nees, inside_3_sigma and runtime_s are None where unknown."""
 
     coverage: float
+    frames_in_span: int
+    compared_at: str
     on_common_frames: ErrorSummary
     nees: dict[str, Any] | None
     inside_3_sigma: dict[str, float] | None
@@ -67,7 +69,7 @@ def write_summary(path: str | Path, summary: Mapping[str, RowSummary]) -> None:
 def read_summary(path: str | Path) -> Summary:
     """Read summary.json.  Raises InputError for a file that is missing or holds something else."""
     content = read_json(path)
-    needed = RowSummary.__required_keys__ - {"inside_3_sigma", "body", "oracle"}
+    needed = RowSummary.__required_keys__ - {"inside_3_sigma", "body", "oracle", "frames_in_span", "compared_at"}
     if not isinstance(content, dict) or not all(
         isinstance(row, dict) and needed <= row.keys() for row in content.values()
     ):
@@ -114,6 +116,8 @@ def _row_summary(row: Row, confidence: float) -> RowSummary:
     return {
         **_error_summary(row),
         "coverage": row.coverage,
+        "frames_in_span": row.frames_in_span,
+        "compared_at": row.frames_of,
         "on_common_frames": _error_summary(row.common()),
         "nees": _nees_summary(row, confidence),
         "inside_3_sigma": inside_3_sigma(row),

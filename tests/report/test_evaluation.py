@@ -21,6 +21,7 @@ from poet_loc.report.evaluate import (
     frames_to_compare,
     pool,
     references_for_both_bodies,
+    stamps_in_gaps,
 )
 from poet_loc.report.summary import inside_3_sigma, read_summary, to_summary, write_errors_csv, write_summary
 
@@ -158,6 +159,7 @@ def test_pooling_weighs_frames_and_keeps_rows_comparable() -> None:
     assert pooled.names == ("a", "b")
     summary = to_summary(pooled)
     assert (summary["a"]["frames"], summary["a"]["coverage"]) == (80, 80 / 120)
+    assert (summary["a"]["frames_in_span"], summary["a"]["compared_at"]) == (120, "the ground truth")
     assert summary["a"]["position_error_mm"]["x"]["mean"] == pytest.approx((60 * 100 + 20 * 400) / 80)
     # b did not run on the second log, so that log says nothing about a against b
     assert summary["a"]["on_common_frames"]["frames"] == summary["b"]["on_common_frames"]["frames"] == 60
@@ -200,6 +202,21 @@ def test_sparse_truth_is_compared_at_the_sensors_stamps_where_it_has_poses_there
     # wide enough a gap to interpolate over
     slow, wide = motion(stamps(20.0, 40, offset_s=0.0037)), EvaluateOptions(max_gap_s=0.1)
     assert frames_to_compare(slow.stamps_ns, stamps(15.0, 30), wide).tolist() == stamps(15.0, 30).tolist()
+
+
+def test_a_long_gap_of_the_sensor_is_compared_at_the_truths_stamps_as_often() -> None:
+    sensor_ns = stamps(30.0, 120, offset_s=0.0037)
+    seconds = (sensor_ns - START_NS) * 1e-9
+    truth_ns = stamps(100.0, 500)
+    missed_ns = stamps_in_gaps(truth_ns, sensor_ns[(seconds < 1.0) | (seconds > 3.0)])
+    assert np.isin(missed_ns, truth_ns).all()
+    assert (len(missed_ns), np.diff(missed_ns).min() >= 3e7) == (60, True)
+    in_gap = (missed_ns - START_NS) * 1e-9
+    assert 0.99 < in_gap.min() < in_gap.max() < 3.0
+    # what it misses now and then, and where there is no truth
+    assert len(stamps_in_gaps(truth_ns, sensor_ns[np.arange(120) % 9 == 0])) == 0
+    assert len(stamps_in_gaps(truth_ns, sensor_ns[(seconds < 1.0) | (seconds > 1.2)])) == 0
+    assert len(stamps_in_gaps(truth_ns[:80], sensor_ns[(seconds < 1.0) | (seconds > 3.0)])) == 0
 
 
 def test_clocks_that_only_beat_share_no_frame_and_it_is_said_why() -> None:
