@@ -40,8 +40,8 @@ PALETTE: tuple[Colour, ...] = (
     (0, 158, 115),
     (204, 121, 167),
     (230, 159, 0),
-    (0, 114, 178),
-)  # Okabe and Ito (2008)
+    (240, 228, 66),
+)  # Okabe and Ito (2008), what reads on black
 _DECISION_COLOURS = (0xD55E00FF, 0xE69F00FF, 0xCC79A7FF, 0x0072B2FF)
 _NOT_SEEN = "not seen"
 
@@ -59,13 +59,21 @@ def write_recording(record: RunRecord, path: str | Path, name: str = "poet-loc")
         recording.log("world", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
         if record.landmark_map is not None and len(record.landmark_map):
             _log_landmarks(recording, "world/landmarks", record, record.landmark_map, PALETTE[4])
-        for body, trajectory in record.references.items():
-            _log_trajectory(recording, record, f"world/ground_truth/{body}", trajectory, body, _TRUTH)
         colours = _colours(record.estimates)
+        paths = [
+            (f"ground_truth/{body}", trajectory, body, f"ground truth ({body})", _TRUTH)
+            for body, trajectory in record.references.items()
+        ]
+        paths += [
+            (f"estimates/{each.name}", each.trajectory, each.body, f"{each.name} ({each.body})", colours[each.name])
+            for each in record.estimates
+        ]
+        for k, (entity, trajectory, body, label, colour) in enumerate(paths):
+            _log_trajectory(recording, record, f"world/{entity}", trajectory, body, colour)
+            _log_name(recording, f"world/{entity}/name", trajectory, (k + 0.5) / len(paths), label, colour)
         for estimate in record.estimates:
-            entity = f"world/estimates/{estimate.name}"
-            _log_trajectory(recording, record, entity, estimate.trajectory, estimate.body, colours[estimate.name])
-            _log_ellipsoids(recording, f"{entity}/position_3_sigma", estimate, colours[estimate.name])
+            entity = f"world/estimates/{estimate.name}/position_3_sigma"
+            _log_ellipsoids(recording, entity, estimate, colours[estimate.name])
         for row in record.evaluation.rows if record.evaluation else ():
             _log_errors(recording, row, colours.get(row.name, _ORACLE))
         for fused in record.fused:
@@ -138,6 +146,16 @@ def _log_trajectory(
             recording.log(f"{pose}/cam", mount, static=True)
             pose = f"{pose}/cam"
         recording.send_columns(f"{pose}/view", first, _pinhole(record.camera, colour))
+
+
+def _log_name(
+    recording: rr.RecordingStream, entity: str, trajectory: Trajectory, share: float, label: str, colour: Colour
+) -> None:
+    """What a path is, written at this share of it, for the view of the world has no legend."""
+    if len(trajectory):
+        position = trajectory.T_world_body.translation[int(share * len(trajectory))]
+        point = rr.Points3D(position, radii=rr.Radius.ui_points(3.0), colors=colour, labels=label, show_labels=True)
+        recording.log(entity, point, static=True)
 
 
 def _log_ellipsoids(recording: rr.RecordingStream, entity: str, estimate: Estimate, colour: Colour) -> None:

@@ -127,6 +127,18 @@ def test_poses_and_errors_are_the_records(run_record: RunRecord, chunks: dict[st
         assert not np.any(column(band, "Measurements:values").to_pylist())
 
 
+def test_paths_are_named_at_places_apart(run_record: RunRecord, chunks: dict[str, list[Chunk]]) -> None:
+    names = {entity: rows for entity, rows in chunks.items() if entity.endswith("/name")}
+    labels = {column(rows, ":labels").to_pylist()[0][0] for rows in names.values()}
+    assert {f"{each.name} ({each.body})" for each in run_record.estimates} <= labels
+    assert "ground truth (cam)" in labels
+    places = {tuple(column(rows, "positions").to_pylist()[0][0]) for rows in names.values()}
+    assert len(places) == len(names)
+    for estimate in run_record.estimates:
+        place = column(chunks[f"world/estimates/{estimate.name}/name"], "positions").to_pylist()[0][0]
+        assert np.abs(estimate.trajectory.T_world_body.translation - place).max(axis=1).min() < 1e-6
+
+
 def test_detections_hang_on_the_true_camera(run_record: RunRecord, chunks: dict[str, list[Chunk]]) -> None:
     rows = column(chunks["world/ground_truth/cam/pose/detections"], "Points3D:positions").to_pylist()
     assert len(rows) == 120
