@@ -31,6 +31,8 @@ class _Merged:
     """By run."""
     errors: dict[str, np.ndarray] = field(default_factory=dict)
     """By entity, as it is drawn."""
+    paths: dict[str, np.ndarray] = field(default_factory=dict)
+    """Points (N, 3) in world by entity."""
     entities: set[str] = field(default_factory=set)
 
     def leading(self, run: str) -> str | None:
@@ -68,8 +70,20 @@ def _renamed(run: str, file: Path, merged: _Merged) -> list[Chunk]:
         if entity.startswith(_ERRORS) and not chunk.is_static and not entity.endswith("/3_sigma"):
             scalars = chunk.to_record_batch().column("Scalars:scalars").flatten()
             merged.errors[place] = np.asarray(scalars, dtype=float)
+        if entity.startswith(_OF_ESTIMATES[0]) and entity.endswith("/path"):
+            merged.paths[place] = _points(chunk)
         chunks.append(chunk.with_entity_path(f"/{place}"))
     return chunks
+
+
+def _points(chunk: Chunk) -> np.ndarray:
+    """What a path, of dots or of strips, goes through."""
+    batch = chunk.to_record_batch()
+    name = next(name for name in batch.schema.names if name.endswith((":positions", ":strips")))
+    points = batch.column(name)
+    for _ in range(3 if name.endswith(":strips") else 2):
+        points = points.flatten()
+    return np.asarray(points, dtype=float).reshape(-1, 3)
 
 
 def _read(file: Path) -> Sequence[Chunk]:
@@ -94,7 +108,7 @@ def _place(entity: str, run: str, merged: _Merged) -> str:
 
 def _colour(out: rr.RecordingStream, merged: _Merged) -> None:
     """Tell the runs apart: a colour for each run's leading estimate, and its name in the legends."""
-    for run, colour in zip(merged.estimates, _cycle(len(merged.estimates)), strict=True):
+    for k, (run, colour) in enumerate(zip(merged.estimates, _cycle(len(merged.estimates)), strict=True)):
         for estimate in merged.estimates[run]:
             name = f"{run}: {estimate}"
             leads: dict[str, Any] = {"colors": [colour]} if estimate == merged.leading(run) else {}
@@ -109,6 +123,13 @@ def _colour(out: rr.RecordingStream, merged: _Merged) -> None:
                 path = f"{_OF_ESTIMATES[0]}{run}/{estimate}/path"
                 kind: Any = rr.Points3D if estimate.startswith("localize/") else rr.LineStrips3D
                 out.log(path, kind.from_fields(**leads), static=True)
+                points = merged.paths[path]
+                position = points[int((k + 0.5) / len(merged.estimates) * len(points))]
+                label = rr.Points3D(position, labels=name, show_labels=True, **leads)
+                out.log(f"{path.removesuffix('path')}name", label, static=True)
+                ellipsoids = f"{path.removesuffix('path')}position_3_sigma"
+                if ellipsoids in merged.entities:
+                    out.log(ellipsoids, rr.Ellipsoids3D.from_fields(**leads), static=True)
                 for view in ("pose/view", "pose/cam/view"):
                     entity = f"{_OF_ESTIMATES[0]}{run}/{estimate}/{view}"
                     if entity in merged.entities:

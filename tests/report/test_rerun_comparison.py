@@ -84,6 +84,26 @@ def test_runs_are_told_apart_in_legends(comparison: Path) -> None:
         assert [f"{run}: {FUSED}"] in names
 
 
+def test_paths_are_named_after_their_runs_at_places_apart(comparison: Path, run_record: RunRecord) -> None:
+    chunks = read(comparison)
+    points = next(each for each in run_record.estimates if each.name == FUSED).trajectory.T_world_body.translation
+    places = []
+    for run in ("before", "after"):
+        batches = [chunk.to_record_batch() for chunk in chunks[f"world/estimates/{run}/{FUSED}/name"]]
+        rows = [
+            (label, position)
+            for batch in batches
+            for label, position in zip(
+                batch.column("Points3D:labels").to_pylist(), batch.column("Points3D:positions").to_pylist(), strict=True
+            )
+        ]
+        label, [place] = rows[-1]
+        assert label == [f"{run}: {FUSED}"]
+        assert np.abs(points - place).max(axis=1).min() < 1e-6
+        places.append(place)
+    assert places[0] != places[1]
+
+
 def test_rerun_verifies_it(comparison: Path, tmp_path: Path) -> None:
     program = Path(sys.executable).parent / "rerun"
     home = os.environ | {"HOME": str(tmp_path)}
