@@ -27,9 +27,9 @@ Mode = Literal["initialising", "tracking", "coasting", "lost"]
 MODES: tuple[Mode, ...] = ("initialising", "tracking", "coasting", "lost")
 Key = tuple[int, int]
 
-FEW_USED, WIDENED, LONG_LOST, LONG_MISSED_S = 2.0 / 3.0, 1.5, 0.01, 1.0
+FEW_USED, WIDENED, LONG_LOST, LONG_MISSED_S, RUNAWAY = 2.0 / 3.0, 1.5, 0.01, 1.0, 100.0
 """What `troubles` tells: a smaller share of poses used, noise taken so many times larger than stated, a larger share of
-time lost, poses so long after the end, s."""
+time lost, poses so long after the end, s, a speed beyond that of any camera that looks at objects, m/s."""
 
 
 @dataclass(frozen=True)
@@ -183,6 +183,9 @@ def troubles(result: FuseResult) -> list[str]:
     if max(health.noise_scale) > WIDENED:
         turn, place = health.noise_scale
         found.append(f"took the 1-sigma of the poses {turn:.1f} (rotation) and {place:.1f} (position) times larger")
+    fastest = float(np.abs(result.velocity).max(initial=0.0))
+    if not fastest <= RUNAWAY:
+        found.append(f"ran away: its speed reached {fastest:.0g} m/s")
     if health.share("lost") > LONG_LOST:
         found.append(f"was lost for {100.0 * health.share('lost'):.0f} % of the time")
     missed_s = float(result.gate.stamps_ns[-1] - result.stamps_ns[-1]) * 1e-9 if len(result.gate) else 0.0

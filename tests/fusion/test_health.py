@@ -108,6 +108,12 @@ def test_health_json_holds_plain_numbers(log):
     assert as_plain(replace(empty, objects={(1, 0): unseen}))["objects"][0]["test_ratio"] is None
 
 
+def test_an_estimate_that_ran_away_is_told(log):
+    result = fuse(log)
+    away = replace(result, velocity=np.where(np.arange(len(result.velocity))[:, None] > 500, 4e7, result.velocity))
+    assert troubles(away) == ["ran away: its speed reached 4e+07 m/s"]
+
+
 def test_troubles_are_told_where_there_are_some(log):
     assert troubles(fuse(log)) == []
     poses, imu = log.object_poses[""], log.imu
