@@ -24,6 +24,8 @@ class Reader:
     """Where it fuses camera poses: these are the solver's, not the log's own."""
     stated: bool = True
     """Where it fuses objects: some detections bring a covariance."""
+    unstated: bool = True
+    """Where it fuses the log's own camera poses: some bring no covariance."""
 
 
 def refuse_unread(options: FuseOptions, readers: Sequence[Reader]) -> None:
@@ -63,6 +65,7 @@ RULES: tuple[Rule[Reader], ...] = (
     Rule("camera_noise.* start.max_camera_speed", "--measurements camera", _measurements("camera")),
     Rule("camera_noise.solver_correlation_s", "camera poses of the solver", lambda reader: reader.solved),
     Rule("camera_noise.[!s]*", "camera poses of the log's own", lambda reader: not reader.solved),
+    Rule("camera_noise.position camera_noise.rotation_deg", "camera poses without covariance", lambda r: r.unstated),
     Rule("noise.stated_*", "detections with covariances", lambda reader: reader.stated),
     Rule("bias.[!u]* noise.stated_over", "bias.use", _asked(lambda o: o.bias.use)),
     Rule("gate.max_noise_scale", "a gate with adaptation", _asked(lambda o: o.gate.adaptation > 0.0)),

@@ -6,6 +6,8 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import numpy as np
+
 from fusion.options import FuseOptions
 from landmarks.options import Mode, SolverOptions
 from landmarks.unread_options import reader_of
@@ -79,6 +81,8 @@ def _readers(
 
     for log in logs:
         stated = any(poses.covariances is not None for poses in _sets(log, detections))
+        given = None if log.camera_poses is None else log.camera_poses.covariances
+        unstated = given is None or not np.isfinite(given).all()
         for fusion in fusions:
             choice = with_fusion(options, fusion)
-            yield Reader(choice, motion_of(log, choice), log.camera_poses is None, stated)
+            yield Reader(choice, motion_of(log, choice), log.camera_poses is None, stated, unstated)

@@ -56,8 +56,10 @@ def with_other(options: FuseOptions, name: str) -> FuseOptions:
 def is_refused(log, base: FuseOptions, name: str) -> bool:
     options = with_other(base, name)
     stated = any(poses.covariances is not None for poses in log.object_poses.values())
+    own = log.camera_poses
+    unstated = own is None or own.covariances is None or np.isnan(own.covariances).any()
     try:
-        refuse_unread(options, [Reader(options, motion_of(log, options), log.camera_poses is None, stated)])
+        refuse_unread(options, [Reader(options, motion_of(log, options), own is None, stated, bool(unstated))])
     except InputError as error:
         return name.replace("_", "-") in error.what
     return False
@@ -97,6 +99,18 @@ def test_what_is_refused_changes_no_number(choice):
     refused = [name for name in names(base) if is_refused(log, base, name)]
     assert len(refused) > 10
     np.testing.assert_array_equal(numbers(log, reduce(with_other, refused, base)), numbers(log, base))
+
+
+def test_the_noise_of_camera_poses_is_read_where_one_states_none():
+    log, base = log_with(camera_poses=True), FuseOptions(measurements="camera")
+    noise = ["camera_noise.position", "camera_noise.rotation_deg"]
+    assert all(is_refused(log, base, name) for name in noise)
+    covariances = log.camera_poses.covariances.copy()
+    covariances[::7] = np.nan
+    log = replace(log, camera_poses=replace(log.camera_poses, covariances=covariances))
+    for name in noise:
+        assert not is_refused(log, base, name)
+        assert not np.array_equal(numbers(log, with_other(base, name)), numbers(log, base))
 
 
 FELT = {
