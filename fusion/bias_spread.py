@@ -21,12 +21,15 @@ from fusion.memory import Memory
 from fusion.nav_state import N_BIAS_KINDS, SPREAD_COUNT, SPREAD_SIZE, SPREADS
 from fusion.noise_scale import PLACE, TURN, scale_of
 from fusion.options import DetectionBias, DetectionNoise
-from fusion.scatter import follow_mean, is_usual_known, spread_by_scatter
+from fusion.scatter import follow_mean, spread_by_scatter
 
 Array = NDArray[np.float64]
 
 LEAST_VARIANCE = 1e-10
 """A detection that calls itself more exact than this, rad^2 and m^2, has this added: its rows would be singular."""
+
+ROUNDING = 1e-6
+"""A detection whose noise is the options' to within this share states none of its own."""
 
 # Places in what the filter knows of the white noise of detections that state none, and how many make a mean.
 WHITE_ROTATION, WHITE_ACROSS, WHITE_ALONG, WHITE_FLOOR, MEAN_OVER = range(5)
@@ -68,20 +71,17 @@ def _share(white: float, varying: float, steady: float, squared: Array, floor: f
 def follow_spreads(m: Memory, log: Columns, first: int, last: int) -> None:
     """Take the white noise of detections first..last-1 into their objects' factors in the nominal array.
 
-    These are geometric means over an object's last detections, so that a moment's doubt is no moment's bias. Where the
-    usual scatter of detections is known, an object's own (`scatter.py`) takes their place.
+    These are geometric means over an object's last detections: a moment's doubt is no moment's bias. Of an object
+    whose detections state nothing, the scatter tells (`scatter.py`).
     """
-    by_scatter = is_usual_known(m)
     for j in range(first, last if m.layout[N_BIAS_KINDS] > 0 else first):
-        if log.kinds[j] == OBJECT_POSE and by_scatter:
-            spread_by_scatter(m, log.objects[j])
-        elif log.kinds[j] == OBJECT_POSE:
+        if log.kinds[j] == OBJECT_POSE:
             _follow_spread(m, log.objects[j], log.covariances[j], log.translations[j])
 
 
 @njit(cache=True)
 def _follow_spread(m: Memory, k: int, R: Array, t: Array) -> None:
-    x, model, at = m.x, m.spread_model, m.layout[SPREADS] + SPREAD_SIZE * k
+    x, model, stated, at = m.x, m.spread_model, m.stated[k], m.layout[SPREADS] + SPREAD_SIZE * k
     squared, along = t[0] ** 2 + t[1] ** 2 + t[2] ** 2, 0.0
     for i in range(3):
         for j in range(3):
@@ -89,11 +89,15 @@ def _follow_spread(m: Memory, k: int, R: Array, t: Array) -> None:
     along /= squared
     across = 0.5 * (R[3, 3] + R[4, 4] + R[5, 5] - along)
     floor = model[WHITE_FLOOR] ** 2
-    turning = (bias_scale(m) * scale_of(m, OBJECT_POSE, TURN)) ** 2
-    placing = (bias_scale(m) * scale_of(m, OBJECT_POSE, PLACE)) ** 2
     x[at + SPREAD_COUNT] = min(x[at + SPREAD_COUNT] + 1.0, model[MEAN_OVER])
     gain = 0.5 / x[at + SPREAD_COUNT]
-    turned = turning * (R[0, 0] + R[1, 1] + R[2, 2])
-    follow_mean(x, at, turned / (3.0 * model[WHITE_ROTATION] ** 2), gain, math.inf)
-    follow_mean(x, at + 1, placing * across / (model[WHITE_ACROSS] ** 2 * squared + floor), gain, math.inf)
-    follow_mean(x, at + 2, placing * along / (model[WHITE_ALONG] ** 2 * squared + floor), gain, math.inf)
+    turn = (R[0, 0] + R[1, 1] + R[2, 2]) / (3.0 * model[WHITE_ROTATION] ** 2)
+    across /= model[WHITE_ACROSS] ** 2 * squared + floor
+    along /= model[WHITE_ALONG] ** 2 * squared + floor
+    placing = scale_of(m, OBJECT_POSE, PLACE) ** 2
+    follow_mean(stated, 0, scale_of(m, OBJECT_POSE, TURN) ** 2 * turn, gain, math.inf)
+    follow_mean(stated, 1, placing * across, gain, math.inf)
+    follow_mean(stated, 2, placing * along, gain, math.inf)
+    states_nothing = max(abs(turn - 1.0), abs(across - 1.0), abs(along - 1.0)) < ROUNDING
+    for i in range(3):
+        x[at + i] = bias_scale(m) * (spread_by_scatter(m, k, i, stated[i]) if states_nothing else stated[i])

@@ -94,6 +94,8 @@ class FittedNoise:
             scatter_rotation_deg=math.degrees(self.scatter[0]),
             scatter_across=float(self.scatter[1]),
             scatter_along=float(self.scatter[2]),
+            scatter_exponent=0.5,
+            scatter_margin=1.0,
             means=tuple(_row_of_means(object_id, mean) for object_id, mean in sorted(self.means.items())),
         )
         return noise, bias

@@ -64,6 +64,7 @@ SUPPOSED, SUPPOSED_SIZE = 6, 16  # hypotheses of each unknown object's pose, see
     AT_PLACES,
     AT_SUPPOSED,
     AT_SCATTER,
+    AT_STATED,
     AT_PAIRS,
     AT_UP,
     END_OF_STATE,
@@ -93,7 +94,7 @@ SUPPOSED, SUPPOSED_SIZE = 6, 16  # hypotheses of each unknown object's pose, see
     AT_TAPE,
     TAPE_SIZE,
     HEADER,
-) = range(38)
+) = range(39)
 
 
 class Memory(NamedTuple):
@@ -108,6 +109,7 @@ class Memory(NamedTuple):
     places: Array  # (K, .) where each object stands against the map: places in place_watch.py
     supposed: Array  # (K, SUPPOSED, .) where an object of unknown pose may be: places in meeting.py; or (0, ..)
     scatter: Array  # (K, .) how much each object's detections differ from one to the next: places in scatter.py
+    stated: Array  # (K, 3) how much more noise than usual the detections of each object state: rotation, across, along
     pairs: Array  # (K + 1, .) how each object's detections disagree with its neighbour's: places in lasting_share.py
     up: Array  # (3,) running mean of the specific force in the axes of the integrated motion
     noise: Array  # of the motion: places in imu.py and odometry.py
@@ -115,7 +117,7 @@ class Memory(NamedTuple):
     start: Array
     bias_model: Array
     spread_model: Array  # of detections that state no noise: places in bias_spread.py
-    usual_scatter: Array  # (3,) of such detections, 0 where it is not known (`scatter.usual_scatter`)
+    usual_scatter: Array  # (5,) of such detections, 0 where it is not known (`scatter.usual_scatter`)
     moved: Array  # when an object counts as moved: places in place_watch.py
     meeting: Array  # when an object of unknown pose is put where it is seen: places in meeting.py
     axes: Array  # (K, 3) symmetry axes
@@ -147,6 +149,7 @@ def allocate(layout: StateLayout) -> tuple[Array, Ints]:
         (AT_PLACES, PLACE_SIZE * max(K, 1)),
         (AT_SUPPOSED, SUPPOSED * SUPPOSED_SIZE * header[H_SUPPOSED]),
         (AT_SCATTER, SCATTER_SIZE * max(K, 1)),
+        (AT_STATED, 3 * max(K, 1)),
         (AT_PAIRS, PAIR_SIZE * (max(K, 1) + 1)),
         (AT_UP, 3),
         (END_OF_STATE, 0),
@@ -155,7 +158,7 @@ def allocate(layout: StateLayout) -> tuple[Array, Ints]:
         (AT_START, 32),
         (AT_BIAS_MODEL, 16),
         (AT_SPREAD_MODEL, 5),
-        (AT_USUAL_SCATTER, 3),
+        (AT_USUAL_SCATTER, 5),
         (AT_MOVED, 12),
         (AT_MEETING, 8),
         (AT_AXES, 3 * max(K, 1)),
@@ -212,6 +215,7 @@ def views(floats: Array, integers: Ints) -> Memory:
         f[i[AT_PLACES] : i[AT_PLACES] + PLACE_SIZE * K].reshape((K, PLACE_SIZE)),
         f[i[AT_SUPPOSED] : i[AT_SCATTER]].reshape((i[H_SUPPOSED], SUPPOSED, SUPPOSED_SIZE)),
         f[i[AT_SCATTER] : i[AT_SCATTER] + SCATTER_SIZE * K].reshape((K, SCATTER_SIZE)),
+        f[i[AT_STATED] : i[AT_STATED] + 3 * K].reshape((K, 3)),
         f[i[AT_PAIRS] : i[AT_PAIRS] + PAIR_SIZE * (K + 1)].reshape((K + 1, PAIR_SIZE)),
         f[i[AT_UP] : i[AT_UP] + 3],
         f[i[AT_NOISE] : i[AT_NOISE] + 12],
@@ -219,7 +223,7 @@ def views(floats: Array, integers: Ints) -> Memory:
         f[i[AT_START] : i[AT_START] + 32],
         f[i[AT_BIAS_MODEL] : i[AT_BIAS_MODEL] + 16],
         f[i[AT_SPREAD_MODEL] : i[AT_SPREAD_MODEL] + 5],
-        f[i[AT_USUAL_SCATTER] : i[AT_USUAL_SCATTER] + 3],
+        f[i[AT_USUAL_SCATTER] : i[AT_USUAL_SCATTER] + 5],
         f[i[AT_MOVED] : i[AT_MOVED] + 12],
         f[i[AT_MEETING] : i[AT_MEETING] + 8],
         f[i[AT_AXES] : i[AT_AXES] + 3 * K].reshape((K, 3)),

@@ -50,6 +50,7 @@ RANGES: dict[str, tuple[str, ...]] = {
         "bias.scatter_rotation_deg",
         "bias.scatter_across",
         "bias.scatter_along",
+        "bias.scatter_exponent",
         "bias.jump",
         "gate.adaptation",
         "prior.attitude_deg",
@@ -97,6 +98,7 @@ RANGES: dict[str, tuple[str, ...]] = {
         "graph.rounds",
     ),
     "[1, inf]": (
+        "bias.scatter_margin",
         "bias.jump_after",
         "noise.stated_over",
         "gate.max_noise_scale",

@@ -76,13 +76,18 @@ class DetectionBias:
     """What is known of the steady one, and taken off the detections: for each object its id and the mean error of its
     rotation x y z, deg in camera axes, and of its place across the ray x y and along it, shares of the distance.
     `fit-noise` finds it from two logs or more; the steady 1-sigma is then of what is left."""
-    scatter_rotation_deg: float = 0.0
-    """How much the rotations of an object's detections usually scatter from one to the next, 1-sigma per axis, deg. An
-    object whose own scatter four times as much is given biases twice as large (`fit-noise` finds it); 0: not known."""
-    scatter_across: float = 0.0
+    scatter_rotation_deg: float = 0.8
+    """How much the rotations of an object's detections usually scatter from one to the next, 1-sigma per axis, deg:
+    where its own scatter more, its biases are larger, where less, smaller (`fit-noise` finds it); 0: not known."""
+    scatter_across: float = 0.002
     """The same of places across the ray, as a share of the distance,"""
-    scatter_along: float = 0.0
+    scatter_along: float = 0.009
     """and along it."""
+    scatter_exponent: float = 0.33
+    """Biases grow with this power of an object's scatter over the usual, from network to network; within one, with the
+    square root, which `fit-noise` writes,"""
+    scatter_margin: float = 1.5
+    """where it is more than so many times larger or smaller, as what is usual is a guess; `fit-noise` writes 1."""
     jump_after: int = 20
     """An object refused so often in a row has another bias: the old one is forgotten."""
     jump: float = 5.0
@@ -207,7 +212,7 @@ class Start:
     """if this share of the window's detections shows them there."""
     lead: float = 1.2
     """A pose is believed if it has so many times the support of any quite other one."""
-    min_span_s: float = 0.3
+    min_span_s: float = 0.26
     """Time that they must span, s; none where two objects agree whole, or min_objects are at their places, and no time
     offset is estimated."""
     window_s: float = 1.0

@@ -237,7 +237,7 @@ def fill_memory(problem: Problem, options: FuseOptions) -> tuple[Array, NDArray[
         _start_at(options.start.pose, options, m)
     m.spread_model[:] = spread_model(options.noise)
     m.usual_scatter[:] = usual_scatter(options.bias) if layout.bias_kinds else 0.0
-    m.scatter[:, :3], m.scatter[:, LAST_NS] = m.usual_scatter, -math.inf
+    m.scatter[:, :3], m.scatter[:, LAST_NS], m.stated[:] = m.usual_scatter[:3], -math.inf, 1.0
     m.bias_model[:] = _bias_model(options.bias)
     m.moved[: place_watch.MIN_POSES + 1] = _moved(options)
     m.meeting[: meeting.REPLACE + 1] = _meeting(options)

@@ -1,10 +1,10 @@
 """How much an object's detections differ from one to the next, and what that says of its biases.
 
 A network that is unsure of an object is unsteady about it, and what it gets wrong for seconds and longer grows with
-that: over objects and videos of YCB-V about as the square root. So where it is known how much the detections of a
-network usually scatter (`fit-noise` measures it), an object's biases are larger or smaller than the options' by the
-square root of how much more or less its own do. They are compared by the filter's residuals, which know how the camera
-moves; a running geometric mean makes of a flip one difference among hundreds.
+that: over objects and videos of YCB-V about as the square root, from one network to another less. So the biases of an
+object whose detections state no covariance are larger or smaller than the options' by a power of how much more or less
+these scatter than usual (`fit-noise` measures that of a network). They are compared by the filter's residuals, which
+know how the camera moves; a running geometric mean makes of a flip one difference among hundreds.
 """
 
 from __future__ import annotations
@@ -15,9 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fusion.compiled import njit
-from fusion.lasting_share import bias_scale
 from fusion.memory import NOW, Memory
-from fusion.nav_state import SPREAD_SIZE, SPREADS
 from fusion.options import DetectionBias
 
 Array = NDArray[np.float64]
@@ -33,14 +31,16 @@ LARGEST_RATIO = 6.0
 # Places in a row of `Memory.scatter`: 1-sigma of rotation (rad), across and along the ray (shares of the distance), how
 # many differences they stand on, the stamp (ns) and the residual of the last detection.
 SIGMAS, COUNT, LAST_NS, LAST = 0, 3, 4, 5
+EXPONENT, MARGIN = 3, 4  # of `Memory.usual_scatter`, behind the three
 
 # What makes the mean logarithm of a chi-square of 3, 2, 1 degrees of freedom over these zero, cut at the largest ratio.
 _OF_ROTATION, _OF_ACROSS, _OF_ALONG = 1.447_552, 1.796_278, 4.100_431
 
 
 def usual_scatter(bias: DetectionBias) -> Array:
-    """Return the usual scatter [rotation (rad), across, along] (3,); zeros where it is not known."""
-    return np.array([math.radians(bias.scatter_rotation_deg), bias.scatter_across, bias.scatter_along])
+    """Return the usual scatter [rotation (rad), across, along, 0: not known, the exponent, the margin] (5,)."""
+    sigmas = (math.radians(bias.scatter_rotation_deg), bias.scatter_across, bias.scatter_along)
+    return np.array([*sigmas, bias.scatter_exponent, bias.scatter_margin])
 
 
 def scatter_of(stamps: Stamps, errors: Array) -> Array:
@@ -75,13 +75,14 @@ def is_usual_known(m: Memory) -> bool:
 
 
 @njit(cache=True)
-def spread_by_scatter(m: Memory, k: int) -> None:
-    """Let the biases of object k spread as its detections so far say."""
-    for i in range(3):
-        if m.usual_scatter[i] > 0.0:
-            m.x[m.layout[SPREADS] + SPREAD_SIZE * k + i] = bias_scale(m) * math.sqrt(
-                m.scatter[k, SIGMAS + i] / m.usual_scatter[i]
-            )
+def spread_by_scatter(m: Memory, k: int, i: int, scale: float) -> float:
+    """Return by how much the biases of object k are larger in part i, where its noise is taken so much larger."""
+    usual, margin = scale * m.usual_scatter[i], m.usual_scatter[MARGIN]
+    if not usual > 0.0:
+        return scale
+    own = m.scatter[k, SIGMAS + i] / usual
+    beyond = own / min(max(own, 1.0 / margin), margin)
+    return float(scale * beyond ** m.usual_scatter[EXPONENT])
 
 
 @njit(cache=True)

@@ -30,6 +30,7 @@ def factors_after(covariances: np.ndarray, t: np.ndarray, k: int = 1) -> np.ndar
     """Return the three factors of object k after detections with this white noise."""
     m, count = memory.views.py_func(*memory.allocate(LAYOUT)), len(covariances)
     m.x[:], m.spread_model[:] = nominal_state(LAYOUT), spread_model(NOISE)
+    m.stated[:] = 1.0
     begin_pairs(m, BIAS.white_below)
     ints, kinds = np.zeros(count, dtype=np.int64), np.full(count, OBJECT_POSE)
     motion = np.zeros(0, dtype=np.int64), np.zeros((0, 9))

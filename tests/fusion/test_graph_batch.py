@@ -222,7 +222,7 @@ def test_the_batch_pushes_nothing_away():
     One object, errors that last; where the bias acted at the estimated position, the camera stood 20 mm too far away.
     """
     behind = []
-    for seed in range(3):
+    for seed in range(6):
         rates = {"imu_rate_hz": 100.0, "camera_rate_hz": 10.0}
         log = simulate(SimulationOptions(duration_s=20.0, seed=seed, objects=1, symmetric_objects=0, **rates))
         smoothed, batch = fuse(log, FuseOptions(smooth=True)), fuse(log, BATCH)

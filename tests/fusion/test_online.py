@@ -121,7 +121,7 @@ def test_shuffled_input_gives_the_in_order_result(layout, seed):
 
 
 def test_shuffled_input_gives_the_in_order_result_where_scatter_sizes_the_biases():
-    options = FuseOptions(bias=DetectionBias(scatter_rotation_deg=1.0, scatter_across=0.002, scatter_along=0.01))
+    options = FuseOptions(bias=DetectionBias(scatter_rotation_deg=1.0, scatter_margin=1.0))
     problem = simulated(noise="network", options=options)
     estimator = estimator_for(problem, options, OnlineOptions(horizon_s=0.4))
     for event in shuffled(problem, 0.4, np.random.default_rng(5)):

@@ -13,17 +13,21 @@ from hypothesis import strategies as st
 from fusion import filter_loop, reference_filter
 from fusion.fit_noise import fit_noise
 from fusion.fuse import fuse
-from fusion.options import DetectionBias, FuseOptions
+from fusion.options import DetectionBias, FuseOptions, Gate
 from fusion.prepare import pose_problem
 from fusion.scatter import scatter_of
 from poet_loc.core.consistency import pose_nees
 from poet_loc.core.input_error import InputError
+from poet_loc.io.log_folder import Log
 
 SIGMAS = np.array([0.02, 0.003, 0.015])
 TIMES = np.repeat(SIGMAS, (3, 2, 1))
 STAMPS = np.arange(4000, dtype=np.int64) * 33_333_333
-KNOWN = DetectionBias(scatter_rotation_deg=1.8, scatter_across=0.0018, scatter_along=0.011)
+KNOWN = DetectionBias(
+    scatter_rotation_deg=1.8, scatter_across=0.0018, scatter_along=0.011, scatter_exponent=0.5, scatter_margin=1.0
+)
 """About what `differing` has in the middle."""
+UNKNOWN = DetectionBias(scatter_rotation_deg=0.0, scatter_across=0.0, scatter_along=0.0)
 
 
 @given(st.integers(0, 10_000), st.floats(0.01, 100.0))
@@ -64,7 +68,7 @@ def test_an_object_that_scatters_less_counts_for_more():
         log = differing(seed, False)
         truth_of = log.T_world_imu
         for known in (True, False):
-            result = fuse(log, FuseOptions(bias=KNOWN if known else DetectionBias()))
+            result = fuse(log, FuseOptions(bias=KNOWN if known else UNKNOWN))
             truth, valid = truth_of.interpolate(result.stamps_ns)
             off = (result.T_world_imu.rotation.inv() * truth.rotation).magnitude()[valid]
             squared[known].append(np.mean(off**2))
@@ -94,11 +98,46 @@ def test_a_graph_takes_each_detection_with_the_biases_that_the_filter_gave_it(ra
     assert np.linalg.norm(end.translation - same.translation) < 0.15 * filtered.sigmas[-1, 3:6].max()
 
 
-def test_nothing_known_changes_nothing_and_impossible_scatter_is_told():
+@pytest.mark.parametrize("exponent", [0.25, 0.5])
+def test_biases_grow_with_that_power_of_the_scatter(exponent):
+    turning = turning_of(differing(0, False), replace(KNOWN, scatter_exponent=exponent))
+    made = np.array([1.0, 2.0, 4.0, 8.0, 16.0])  # by how much the rotations scatter, against each other
+    np.testing.assert_allclose(turning / turning[2], (made / made[2]) ** exponent, rtol=0.2)
+
+
+def test_what_is_usual_to_within_the_margin_says_nothing():
     log = differing(0, False)
-    part = replace(DetectionBias(), scatter_along=0.0, scatter_rotation_deg=0.0)
-    np.testing.assert_array_equal(
-        fuse(log, FuseOptions(bias=part)).T_world_imu.translation, fuse(log, FuseOptions()).T_world_imu.translation
-    )
+    free, within = (turning_of(log, replace(KNOWN, scatter_margin=margin)) for margin in (1.0, 3.0))
+    assert within[1:4] == pytest.approx(1.0)  # these scatter a half to twice the usual
+    np.testing.assert_allclose(within[[0, 4]], free[[0, 4]] * [3.0**0.5, 3.0**-0.5], rtol=1e-2)
+
+
+def test_what_states_its_covariance_is_believed_whatever_it_scatters():
+    log = differing(0, False)
+    detections = log.object_poses[""]
+    covariances = np.tile(np.diag(np.r_[np.full(3, 0.1), np.full(3, 0.03)] ** 2), (len(detections), 1, 1))
+    stating = replace(log, object_poses={"": replace(detections, covariances=covariances)})
+    turning = turning_of(stating, KNOWN)
+    np.testing.assert_allclose(turning, turning[0], rtol=1e-6)
+    np.testing.assert_array_equal(turning, turning_of(stating, UNKNOWN))
+
+
+def turning_of(log: Log, bias: DetectionBias) -> np.ndarray:
+    """Return by how much larger the objects' biases of rotation are in the end."""
+    options = FuseOptions(bias=bias, gate=Gate(adaptation=0.0))
+    problem = pose_problem(log, options)
+    memory = run(filter_loop.run_log, problem, options).memory
+    return memory.x[problem.layout.spread_start :].reshape(-1, 4)[:, 0].copy()
+
+
+def test_no_power_is_not_to_know():
+    log = differing(0, False)
+    none = fuse(log, FuseOptions(bias=DetectionBias(scatter_exponent=0.0))).T_world_imu
+    unknown = fuse(log, FuseOptions(bias=UNKNOWN)).T_world_imu
+    assert np.abs(none.translation - unknown.translation).max() < 1e-9
+    assert np.abs(none.translation - fuse(log, FuseOptions()).T_world_imu.translation).max() > 1e-4
+
+
+def test_impossible_scatter_is_told():
     with pytest.raises(InputError, match="scatter-along"):
         FuseOptions(bias=DetectionBias(scatter_along=-0.1))
