@@ -15,6 +15,7 @@ from fusion.compiled import njit
 from fusion.imu import write_gravity_basis
 from fusion.memory import Memory, Work
 from fusion.nav_state import (
+    ACCEL_BIAS_ERROR,
     AT_BIASES,
     AT_CLONE,
     AT_EXTRINSICS,
@@ -25,6 +26,7 @@ from fusion.nav_state import (
     CLONE,
     EXTRINSIC_ROTATION,
     GRAVITY,
+    GYRO_BIAS_ERROR,
     N_BIAS_KINDS,
     N_ERROR,
     N_OBJECTS,
@@ -33,6 +35,7 @@ from fusion.nav_state import (
     POSITION,
     POSITION_ERROR,
     TIME_OFFSET,
+    VELOCITY,
     Array,
     Ints,
 )
@@ -124,11 +127,15 @@ def correct(m: Memory, w: Work, first: int, size: int) -> None:
     whiten(w.L, w.residual, first, size, w.white)
     _gain(m, w, first, size)
     _condition(m.P, w.Z, size)
-    before = w.scratch[32:47]
+    before = w.scratch[32:50]
     for i in range(15):
         before[i] = m.x[i]
+    for i in range(3):
+        before[15 + i] = m.x[GRAVITY + i]
     inject(m.x, w.error, m.layout, w.scratch)
     transport(m.P, before, m.x, w.error, m.layout, w.scratch)
+    if m.layout[AT_TIME_OFFSET] >= 0:
+        transport_clock(m, w, before)
 
 
 @njit(cache=True)
@@ -250,6 +257,44 @@ def transport(P: Array, before: Array, x: Array, error: Array, layout: Ints, scr
         lever_of_part(layout, part, before, x, error, skewed)
         _add_rows_and_columns(P, n, row_of_part(layout, part), skewed)
     _turn_rows_and_columns(P, n, G, scratch)
+
+
+@njit(cache=True)
+def transport_clock(m: Memory, w: Work, before: Array) -> None:
+    """Carry P on for the time offset, whose error d moves attitude, position and velocity by w, v and a times d.
+
+    Noise in w, v and a would tell the filter of d: of a camera at rest, that moves as corrections change their mind. So
+    P is carried along with the errors held that the state has at the camera's time, R Exp(w d), p + v d and v + a d:
+    theta+ += (R+^T R- w- - w+) d, dp+ += (v- - v+ + (R- w-) x (p+ - p-)) d, dv+ += (a- - a+ + (R- w-) x (v+ - v-)) d.
+    before (18,) is R, p, v and gravity before the correction. The nine factors are left in w.scratch[50:59].
+    """
+    x, error, G, turned, u = m.x, w.error, w.scratch[0:9], w.scratch[9:18], w.scratch[50:59]
+    multiply_transposed_left(x, before, G)
+    apply(G, w.rate[0], w.rate[1], w.rate[2], turned[0:3])
+    apply(before, w.rate[0], w.rate[1], w.rate[2], turned[3:6])
+    apply(before, w.force[0], w.force[1], w.force[2], turned[6:9])
+    for i in range(3):
+        u[i] = turned[i] - w.rate[i] + error[GYRO_BIAS_ERROR + i]
+        j, k = (i + 1) % 3, (i + 2) % 3
+        for part in range(2):
+            at = POSITION + 3 * part
+            u[3 + 3 * part + i] = turned[3 + j] * (x[at + k] - before[at + k])
+            u[3 + 3 * part + i] -= turned[3 + k] * (x[at + j] - before[at + j])
+        u[3 + i] += before[VELOCITY + i] - x[VELOCITY + i]
+        u[6 + i] += turned[6 + i] + before[15 + i] - x[GRAVITY + i]
+    for i in range(3):
+        w.rate[i] -= error[GYRO_BIAS_ERROR + i]
+        w.force[i] -= error[ACCEL_BIAS_ERROR + i]
+    apply(x, w.force[0], w.force[1], w.force[2], turned[0:3])
+    for i in range(3):
+        u[6 + i] -= turned[i]
+    at, P = m.layout[AT_TIME_OFFSET], m.P
+    for i in range(9):
+        for j in range(len(P)):
+            P[i, j] += u[i] * P[at, j]
+    for j in range(len(P)):
+        for i in range(9):
+            P[j, i] += u[i] * P[j, at]
 
 
 @njit(cache=True)

@@ -153,7 +153,7 @@ def watch_gravity(m: Memory, w: Work, dt: float) -> None:
 
 @njit(cache=True)
 def find_rate(m: Memory, w: Work, imu_stamps: Ints, imu_values: Array) -> None:
-    """Write the unbiased angular velocity at the filter's stamp into w.rate."""
+    """Write the unbiased angular velocity and specific force at the filter's stamp into w.rate and w.force."""
     k = m.counters[IMU_AT]
     share = 0.0
     following = k
@@ -163,3 +163,5 @@ def find_rate(m: Memory, w: Work, imu_stamps: Ints, imu_values: Array) -> None:
     for i in range(3):
         value = imu_values[k, i] + share * (imu_values[following, i] - imu_values[k, i])
         w.rate[i] = value - m.x[GYRO_BIAS + i]
+        value = imu_values[k, 3 + i] + share * (imu_values[following, 3 + i] - imu_values[k, 3 + i])
+        w.force[i] = value - m.x[ACCEL_BIAS + i]

@@ -195,7 +195,7 @@ def allocate(layout: StateLayout) -> tuple[Array, Ints]:
 def work_size(n: int) -> int:
     """Return how many floats of work space a filter with n error states needs."""
     return (
-        256 + 45 + 6 + 17 * CORE + 3 * n + 6 + 6 * MAX_COLUMNS + 6 * n + 36 + 36 + 36 + 6 + 6 * n + n + 12 + 128 + 3 + 1
+        256 + 45 + 6 + 17 * CORE + 3 * n + 6 + 6 * MAX_COLUMNS + 6 * n + 36 + 36 + 36 + 6 + 6 * n + n + 12 + 128 + 6 + 1
     )
 
 
@@ -261,6 +261,7 @@ class Work(NamedTuple):
     measured: Array  # R_m (9), t_m (3)
     scratch: Array
     rate: Array  # (3,) unbiased angular velocity at the measurements' stamp, rad/s
+    force: Array  # (3,) unbiased specific force there, m/s^2
     offset: Array  # (1,) by how much later than their stamp says measurements are taken in, s
 
 
@@ -300,5 +301,6 @@ def work_views(work: Array, n: int) -> Work:
         work[r:s],
         work[s : s + 128],
         work[s + 128 : s + 131],
-        work[s + 131 : s + 132],
+        work[s + 131 : s + 134],
+        work[s + 134 : s + 135],
     )

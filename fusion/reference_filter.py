@@ -21,8 +21,11 @@ from fusion.lasting_share import MET
 from fusion.measurements import OBJECT_POSE, ODOMETRY_STEP
 from fusion.meeting import PUT, UNKNOWN_MAP, choose_anchor
 from fusion.nav_state import (
+    ACCEL_BIAS,
+    ACCEL_BIAS_ERROR,
     EXTRINSIC_ROTATION,
     GYRO_BIAS,
+    GYRO_BIAS_ERROR,
     OBJECT_SIZE,
     OBJECTS,
     POSITION,
@@ -54,6 +57,7 @@ from fusion.reference_models import (
     residual_and_jacobian,
     transition,
     transport,
+    transport_clock,
 )
 from fusion.refused_odometry import follow_refusals
 from fusion.result import FuseResult
@@ -229,6 +233,11 @@ class ReferenceFilter:
         error = self.condition(residual, H, R)
         m.x[:] = retract_state(before, error, self.layout)
         self.spread(transport(before, m.x, error, self.layout), np.zeros_like(m.P))
+        if self.layout.time_offset:
+            rate, force = self.work.rate, self.work.force
+            self.spread(transport_clock(before, m.x, error, rate, force, self.layout), np.zeros_like(m.P))
+            rate -= error[GYRO_BIAS_ERROR : GYRO_BIAS_ERROR + 3]
+            force -= error[ACCEL_BIAS_ERROR : ACCEL_BIAS_ERROR + 3]
 
     def clone(self) -> None:
         """Let the clone be the pose of now."""
@@ -342,8 +351,9 @@ def run_log(floats: Array, integers: Ints, log: Columns, rows: Rows) -> int:
             f.advance(imu_stamps, imu_values, stamp)
             if due <= end:
                 last = int(np.searchsorted(stamps, stamps[j] + 1))
-                gyro = [np.interp(stamp - imu_stamps[0], since, imu_values[:, i]) for i in range(3)]
-                f.work.rate[:] = np.array(gyro) - f.m.x[GYRO_BIAS : GYRO_BIAS + 3]
+                imu = np.array([np.interp(stamp - imu_stamps[0], since, imu_values[:, i]) for i in range(6)])
+                f.work.rate[:] = imu[:3] - f.m.x[GYRO_BIAS : GYRO_BIAS + 3]
+                f.work.force[:] = imu[3:] - f.m.x[ACCEL_BIAS : ACCEL_BIAS + 3]
                 f.work.offset[0] = (stamp - stamps[j]) * 1e-9
                 f.measure(log, j, last)
                 f.m.counters[memory.LAST_STAMP] = stamps[j]

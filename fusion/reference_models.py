@@ -277,6 +277,24 @@ def transport(before: Array, after: Array, error: Array, layout: StateLayout) ->
     return G
 
 
+def transport_clock(before: Array, after: Array, error: Array, rate: Array, force: Array, layout: StateLayout) -> Array:
+    """Return the dense G (n, n) that carries a covariance on for the time offset (see `eskf.transport_clock`).
+
+    rate and force (3,) are unbiased, before the correction.
+    """
+    G = np.eye(layout.n_error)
+    if not layout.time_offset:
+        return G
+    d = layout.error_slice("time_offset").start
+    R_before, R_after = before[:9].reshape(3, 3), after[:9].reshape(3, 3)
+    w_world, moved = R_before @ rate, after - before
+    forces = R_before @ force - R_after @ (force - error[BA])
+    G[ATT, d] = R_after.T @ w_world - (rate - error[BG])
+    G[POS, d] = np.cross(w_world, moved[POSITION : POSITION + 3]) - moved[VELOCITY : VELOCITY + 3]
+    G[VEL, d] = np.cross(w_world, moved[VELOCITY : VELOCITY + 3]) + forces - moved[GRAVITY : GRAVITY + 3]
+    return G
+
+
 def nearest_symmetric(R_m: Array, R_co: Array, axis: Array, order: int) -> Array:
     """Return a measured rotation turned about the object's symmetry axis to where it fits the prediction best."""
     quaternion = Rotation.from_matrix(R_m.T @ R_co).as_quat(canonical=True)

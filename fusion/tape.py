@@ -7,6 +7,7 @@ length and its kind; numbers of any type are stored as floats.
     ODOMETRY    Exp(w dt) (9), R skew(step) (9)
     DECAY       the factor of every object bias
     CORRECTION  parts, G (9), skew blocks (9 each); rows, columns, their numbers, L^-1 H, L^-1 residual, Z = L^-1 H P
+    CLOCK       what a correction adds to the core's first nine errors per time offset (`eskf.transport_clock`)
     MEETING     the object's first error state, columns, their numbers, the derivative of its pose by them (6 rows)
     FORGETTING  first error state, how many
     RESTART     which error states (n) survive
@@ -25,6 +26,7 @@ from fusion.memory import AT_TAPE, BIAS_TIME, NOW, RESTARTS, TAPE_END, TAPE_SIZE
 from fusion.nav_state import (
     AT_BIASES,
     AT_OBJECTS,
+    AT_TIME_OFFSET,
     BIASES,
     CORE,
     EXTRINSIC_ROTATION,
@@ -38,7 +40,7 @@ from fusion.nav_state import (
 from fusion.object_biases import bias_phi, fades
 from fusion.so3_kernels import multiply_transposed_left
 
-STEP, ODOMETRY, DECAY, CORRECTION, MEETING, FORGETTING, RESTART, ROW, CLONING = range(9)
+STEP, ODOMETRY, DECAY, CORRECTION, MEETING, FORGETTING, RESTART, ROW, CLONING, CLOCK = range(10)
 STEP_SIZE, TAIL = 52, 2
 
 
@@ -54,7 +56,7 @@ def tape_bound(layout: Ints, samples: int, stamps: int, measurements: int) -> in
     n, K = int(layout[N_ERROR]), int(layout[N_OBJECTS])
     biases = 6 * K * int(layout[N_BIAS_KINDS])
     steps, row = (samples + stamps) * (STEP_SIZE + TAIL), 1 + CORE + 6 + CORE * n + TAIL
-    correction = 1 + 9 * (3 + K) + 2 + MAX_COLUMNS + 6 * MAX_COLUMNS + 6 + 6 * n + TAIL
+    correction = 1 + 9 * (3 + K) + 2 + MAX_COLUMNS + 6 * MAX_COLUMNS + 6 + 6 * n + TAIL + 9 + TAIL
     meeting_and_forgetting = 2 + MAX_COLUMNS + 6 * MAX_COLUMNS + TAIL + 8 * (2 + TAIL)
     per_stamp = biases + TAIL + 2 * (n + TAIL) + 18 + TAIL
     return steps + (samples + stamps) * row + stamps * per_stamp + measurements * (correction + meeting_and_forgetting)
@@ -134,6 +136,11 @@ def note_correction(m: Memory, w: Work, first: int, size: int, count: int) -> No
         for j in range(n):
             tape[at + size + r * n + j] = w.Z[r, j]
     _close(m, at + size + size * n, CORRECTION)
+    if m.layout[AT_TIME_OFFSET] >= 0:
+        at = m.counters[TAPE_END]
+        for i in range(9):
+            tape[at + i] = w.scratch[50 + i]
+        _close(m, at + 9, CLOCK)
 
 
 @njit(cache=True)

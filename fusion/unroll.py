@@ -11,6 +11,7 @@ from fusion.nav_state import (
     AT_BIASES,
     AT_CLONE,
     AT_GRAVITY,
+    AT_TIME_OFFSET,
     CORE,
     EXTRINSIC_ROTATION,
     GYRO_BIAS_ERROR,
@@ -20,7 +21,7 @@ from fusion.nav_state import (
     Array,
     Ints,
 )
-from fusion.tape import CLONING, CORRECTION, DECAY, FORGETTING, MEETING, ODOMETRY, ROW, STEP, TAIL
+from fusion.tape import CLOCK, CLONING, CORRECTION, DECAY, FORGETTING, MEETING, ODOMETRY, ROW, STEP, TAIL
 
 
 @njit(cache=True)
@@ -61,6 +62,8 @@ def unroll(
             _back_over_meeting(record, layout[N_ERROR], gradient, information)
         elif kind == CLONING:
             _back_over_cloning(record, layout, gradient, information)
+        elif kind == CLOCK:
+            _back_over_clock(record, layout[AT_TIME_OFFSET], gradient, information)
         elif kind == FORGETTING:
             for i in range(int(record[1])):
                 _scale(information, gradient, layout[N_ERROR], int(record[0]) + i, 0.0)
@@ -189,6 +192,17 @@ def _back_over_correction(record: Array, layout: Ints, gradient: Array, informat
         for c in range(count):
             gradient[int(columns[c])] += H[r, c] * M[0, r]
     _back_over_conditioning(H, columns, Z, information, U, M)
+
+
+@njit(cache=True)
+def _back_over_clock(record: Array, at: int, gradient: Array, information: Array) -> None:
+    for i in range(len(record)):
+        gradient[at] += record[i] * gradient[i]
+        for j in range(len(gradient)):
+            information[at, j] += record[i] * information[i, j]
+    for i in range(len(record)):
+        for j in range(len(gradient)):
+            information[j, at] += record[i] * information[j, i]
 
 
 @njit(cache=True)
