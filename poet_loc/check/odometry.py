@@ -1,4 +1,4 @@
-"""Checks of odometry alone: jumps and holes of its tracking."""
+"""Checks of odometry: jumps and holes of its tracking, and its scale beside the detections."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ import numpy as np
 
 from poet_loc.check.finding import Evidence, Finding
 from poet_loc.core.odometry_breaks import Break, Expected, hole_between, odometry_breaks
+from poet_loc.core.odometry_scale import odometry_scale
 from poet_loc.io.log_folder import Log
 
 EXPECTED = Expected((float(np.radians(0.25)), 0.005), 0.1, (0.5, 0.3))
@@ -15,7 +16,7 @@ EXPECTED = Expected((float(np.radians(0.25)), 0.005), 0.1, (0.5, 0.3))
 
 
 def check_odometry(log: Log) -> Iterator[Finding]:
-    """Yield jumps and holes of T_odom_cam.tum, each kind once with where its worst is."""
+    """Yield jumps and holes of T_odom_cam.tum, each kind once with where its worst is, and another scale."""
     breaks = breaks_of(log, EXPECTED)
     jumps, holes = [each for each in breaks if not each.hole], [each for each in breaks if each.hole]
     if jumps:
@@ -26,6 +27,18 @@ def check_odometry(log: Log) -> Iterator[Finding]:
         what = "the odometry has holes, begins late or ends early: its tracking was lost"
         fix = "see whether the camera was covered, blurred or too fast; fusion does not know how it moved meanwhile"
         yield _finding("odometry-hole", what, fix, holes, max(holes, key=lambda each: each.seconds))
+    yield from check_odometry_scale(log)
+
+
+def check_odometry_scale(log: Log) -> Iterator[Finding]:
+    """Yield odometry whose ways are not as long as the ones by which the detected objects pass."""
+    scale = odometry_scale(log.T_odom_cam, log.object_poses.values())
+    if scale is None or not scale.contradicts:
+        return
+    evidence: Evidence = {"factor": scale.factor, "sigma_of_its_logarithm": scale.error, "ways": scale.ways}
+    what = f"the odometry's ways are {scale.factor:.3g} times as long as those by which the objects pass"
+    fix = f"divide its positions by {scale.factor:.3g} (metres? monocular?); or is it the detections' distances?"
+    yield Finding("odometry-scale", "error", "T_odom_cam.tum", what, fix, evidence)
 
 
 def breaks_of(log: Log, expected: Expected) -> list[Break]:

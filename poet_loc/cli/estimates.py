@@ -14,7 +14,7 @@ from fusion.options import FuseOptions
 from fusion.result import FuseResult
 from landmarks.localize import LocalizeOptions, LocalizeResult, localize
 from landmarks.options import MODES, ORACLES, Mode, SolverOptions
-from poet_loc.check.odometry import breaks_of
+from poet_loc.check.odometry import breaks_of, check_odometry_scale
 from poet_loc.check.units import check_accelerometer, check_gyroscope
 from poet_loc.cli.terminal import Report
 from poet_loc.core.input_error import InputError
@@ -248,6 +248,8 @@ def _fused(
     refused = _refused_units(log, detections, attempt.report) if with_imu else None
     if with_imu and refused is None:
         _tell_of_time_offset(log, detections, options.fusion, attempt.report)
+    if any(map(_takes_odometry, choices)):
+        _tell_of_odometry_scale(log, detections, attempt.report)
     there = {"objects": object_poses is not None, "camera": log.camera_poses is not None or from_solver is not None}
     for fusion, choice in zip(fusions, choices, strict=True):
         if not there[choice.measurements] and not attempt.strict:
@@ -263,6 +265,10 @@ def _fused(
 
 def _takes_imu(options: FuseOptions) -> bool:
     return options.motion in ("auto", "imu", "imu+odometry")
+
+
+def _takes_odometry(options: FuseOptions) -> bool:
+    return options.motion in ("auto", "odometry", "imu+odometry")
 
 
 def _refused_units(log: Log, detections: str | None, report: Report) -> InputError | None:
@@ -292,6 +298,13 @@ def _tell_of_time_offset(log: Log, detections: str | None, options: FuseOptions,
     what = f"the poses turn as the gyroscope does at timeshift_cam_imu: {found}, not at {stated:g} s"
     fix = "put it into calibration.yaml, or see --estimate.time-offset"
     report.note(f"{log.path}: {what}; {'the estimate begins there' if options.estimate.time_offset else fix}")
+
+
+def _tell_of_odometry_scale(log: Log, detections: str | None, report: Report) -> None:
+    """Note where the odometry's unit of length is not the detections'."""
+    poses = {} if detections is None else {detections: log.object_poses[detections]}
+    for finding in check_odometry_scale(replace(log, object_poses=poses)):
+        report.note(f"{log.path / finding.file}: {finding.what}; {finding.fix}")
 
 
 def _solved(

@@ -74,6 +74,19 @@ def broken_odometry(length_s: float, jump_m: float) -> SpoilLog:
     return spoil
 
 
+def scaled_odometry(scale: float) -> SpoilLog:
+    """Add odometry that is the truth in another unit."""
+
+    def spoil(log: Log) -> Log:
+        poses = log.T_world_cam.T_world_body
+        return replace(
+            log,
+            T_odom_cam=Trajectory(log.T_world_cam.stamps_ns, make_pose(poses.rotation, scale * poses.translation)),
+        )
+
+    return spoil
+
+
 def part_of_odometry(first_s: float, last_s: float) -> SpoilLog:
     """Add odometry that is the truth, and there from one time to another only."""
 
@@ -333,6 +346,8 @@ SPOILED_LOGS: dict[str, tuple[SpoilLog, set[str], bool]] = {
     "odometry with a hole": (broken_odometry(1.5, 0.0), {"odometry-hole"}, False),
     "odometry that begins late": (part_of_odometry(2.0, 1e9), {"odometry-hole"}, False),
     "odometry that ends early": (part_of_odometry(0.0, 5.0), {"odometry-hole"}, False),
+    "odometry that is a fifth too long": (scaled_odometry(1.2), {"odometry-scale"}, False),
+    "odometry that is a fifth too short": (scaled_odometry(0.8), {"odometry-scale"}, False),
     "stamps of receipt": (receive_times, {"jitter"}, False),
     "stamps in microseconds": (microseconds, {"stamp-unit"}, True),
     "imu ends early": (short_imu, {"imu-span"}, False),

@@ -18,6 +18,7 @@ from fusion.simulate import SimulationOptions, simulate
 from poet_loc.cli import run as run_command
 from poet_loc.cli import view as view_command
 from poet_loc.cli.main import main
+from poet_loc.core.geometry import make_pose
 from poet_loc.core.trajectory import Trajectory
 from poet_loc.io.calibration_yaml import read_calibration
 from poet_loc.io.camera_poses_csv import read_camera_poses, write_camera_poses
@@ -443,3 +444,13 @@ def test_what_cannot_be_compared_is_told_in_one_line(log, tmp_path, capsys):
     rows = summary(tmp_path / "run")
     assert rows["fuse/eskf/objects"]["coverage"] > 0.9
     assert rows["fuse/eskf/objects"]["on_common_frames"]["frames"] > 50
+
+
+@pytest.mark.parametrize(("scale", "told"), [(1.2, True), (1.0, False)])
+def test_odometry_of_another_scale_is_noted(scale, told, log, tmp_path, capsys):
+    whole = read_log(log)
+    truth = whole.T_world_cam
+    poses = make_pose(truth.T_world_body.rotation, scale * truth.T_world_body.translation)
+    write_tum(log / "T_odom_cam.tum", Trajectory(truth.stamps_ns, poses))
+    assert main(["fuse", str(log), "--out", str(tmp_path / "run"), "--no-pictures"]) == 0
+    assert ("times as long as those by which the objects pass" in capsys.readouterr().err) == told
