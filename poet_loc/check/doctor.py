@@ -13,6 +13,7 @@ from poet_loc.check.gravity import check_gravity
 from poet_loc.check.noise import check_noise
 from poet_loc.check.objects import (
     check_ground_truth,
+    check_in_front,
     check_landmarks,
     check_rotations_against_map,
     check_unknown_objects,
@@ -35,6 +36,7 @@ CHECKS: tuple[Check, ...] = (
     check_imu_covers,
     check_unknown_objects,
     check_rotations_against_map,
+    check_in_front,
     check_lengths,
     check_accelerometer,
     check_gyroscope,

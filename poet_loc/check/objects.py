@@ -25,6 +25,7 @@ Array = NDArray[np.float64]
 Rows = NDArray[np.intp]
 
 _LEAST_SEEN = 20
+_LEAST_BEHIND, _BEHIND = 5, 0.1
 _MOST_ROWS = 1500
 _FITS_DEG, _MISFITS_DEG = 15.0, 40.0
 _OUT_OF_PLACE_M, _OUT_OF_PLACE_DEG = 0.08, 15.0
@@ -53,6 +54,26 @@ def check_unknown_objects(log: Log) -> Iterator[Finding]:
         fix = "add the objects to the map, leave their rows out, or correct the numbering of the classes"
         repair = _without(name, ids) if unknown.mean() < 0.5 else None
         yield Finding("unknown-object", "error", object_poses_file(name), what, fix, evidence, repair)
+
+
+def check_in_front(log: Log) -> Iterator[Finding]:
+    """Yield detections behind the camera, where nothing is seen.
+
+    Where all are, and objects lie beside each other as in the map, it is another camera's axes: OpenGL's, it seems.
+    """
+    misfits = _misfits(log)
+    for name, poses in log.object_poses.items():
+        behind = poses.T_cam_obj.translation[:, 2] <= 0.0
+        if np.count_nonzero(behind) < _LEAST_BEHIND or behind.mean() < _BEHIND:
+            continue
+        evidence: Evidence = {"detections_behind": int(np.count_nonzero(behind)), "of_all_detections": len(poses)}
+        all_but_axes = behind.all() and name in misfits and misfits[name]["as is", "as is"] < _FITS_DEG
+        what = f"{100.0 * behind.mean():.0f} % of the detections are behind the camera: tz is negative"
+        fix = (
+            "write T_cam_obj with x right, y down, z forward; OpenGL's camera becomes that by diag(1, -1, -1) T_cam_obj"
+        )
+        repair = _from_opengl(name) if all_but_axes else None
+        yield Finding("behind-camera", "error", object_poses_file(name), what, fix, evidence, repair)
 
 
 def check_rotations_against_map(log: Log) -> Iterator[Finding]:
@@ -277,6 +298,19 @@ def _without(name: str, ids: NDArray[np.int64]):  # type: ignore[no-untyped-def]
     def repair(log: Log) -> Log:
         poses = log.object_poses[name]
         return replace(log, object_poses={**log.object_poses, name: poses[~np.isin(poses.object_ids, ids)]})
+
+    return repair
+
+
+def _from_opengl(name: str):  # type: ignore[no-untyped-def]
+    def repair(log: Log) -> Log:
+        half_turn = RigidTransform.from_rotation(Rotation.from_quat([1.0, 0.0, 0.0, 0.0]))
+        poses, covariances = log.object_poses[name], log.object_poses[name].covariances
+        if covariances is not None:
+            signs = np.array([1.0, -1.0, -1.0, 1.0, -1.0, -1.0])
+            covariances = covariances * np.outer(signs, signs)
+        turned = replace(poses, T_cam_obj=half_turn * poses.T_cam_obj, covariances=covariances)
+        return replace(log, object_poses={**log.object_poses, name: turned})
 
     return repair
 

@@ -14,6 +14,7 @@ from fusion.options import FuseOptions
 from fusion.result import FuseResult
 from landmarks.localize import LocalizeOptions, LocalizeResult, localize
 from landmarks.options import MODES, ORACLES, Mode, SolverOptions
+from poet_loc.check.objects import check_in_front, check_rotations_against_map
 from poet_loc.check.odometry import breaks_of, check_odometry_scale
 from poet_loc.check.units import check_accelerometer, check_gyroscope
 from poet_loc.cli.terminal import Report
@@ -106,6 +107,7 @@ def estimate_log(
         log = replace(log, T_world_cam=None, T_world_imu=None)
     if log.object_poses and (log.landmark_map is not None or own_world):
         name = log.detections(detections)[0]
+        _tell_of_other_axes(log, name, report)
     elif detections is not None or log.camera_poses is None:
         log.detections(detections)
     attempt = _Attempt(report, strict)
@@ -128,6 +130,13 @@ def estimate_log(
     else:
         evaluation = evaluate_estimates(log, name, _estimates(log, localized, fused), options.evaluation, report)
     return Estimates(log, name, localized, fused, evaluation)
+
+
+def _tell_of_other_axes(log: Log, detections: str, report: Report) -> None:
+    """Note detections, or a map, that only make sense written otherwise: a filter may get along with their places."""
+    log = replace(log, object_poses={detections: log.object_poses[detections]})
+    for finding in (*check_rotations_against_map(log), *check_in_front(log)):
+        report.note(f"{log.path / finding.file}: {finding.what}; {finding.fix}")
 
 
 def _tell_of_moved_objects(log: Log, result: FuseResult, report: Report) -> None:

@@ -74,6 +74,12 @@ def broken_odometry(length_s: float, jump_m: float) -> SpoilLog:
     return spoil
 
 
+def opengl_camera(log: Log) -> Log:
+    turned = make_pose(Rotation.from_rotvec([np.pi, 0.0, 0.0]), np.zeros(3))
+    poses = {name: replace(each, T_cam_obj=turned * each.T_cam_obj) for name, each in log.object_poses.items()}
+    return replace(log, object_poses=poses)
+
+
 def scaled_odometry(scale: float) -> SpoilLog:
     """Add odometry that is the truth in another unit."""
 
@@ -359,6 +365,7 @@ SPOILED_LOGS: dict[str, tuple[SpoilLog, set[str], bool]] = {
     "detections 80 ms late": (late_detections, {"time-offset"}, False),
     "detections w, x, y, z": (detections("wxyz"), {"quaternion-order"}, True),
     "detections inverted": (detections("inverse"), {"poses-inverted"}, True),
+    "detections in OpenGL's axes": (opengl_camera, {"behind-camera"}, True),
     "map w, x, y, z": (mapped("wxyz"), {"quaternion-order"}, True),
     "map inverted": (mapped("inverse"), {"poses-inverted"}, True),
     "camera truth w, x, y, z": (truth("T_world_cam", "wxyz"), {"quaternion-order"}, True),

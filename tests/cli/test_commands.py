@@ -7,11 +7,13 @@ import re
 import shutil
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 import yaml
+from scipy.spatial.transform import Rotation
 from test_main import one_line
 
 from fusion.simulate import SimulationOptions, simulate
@@ -24,6 +26,7 @@ from poet_loc.io.calibration_yaml import read_calibration
 from poet_loc.io.camera_poses_csv import read_camera_poses, write_camera_poses
 from poet_loc.io.landmarks_json import read_landmarks
 from poet_loc.io.log_folder import read_log
+from poet_loc.io.object_poses_csv import write_object_poses
 from poet_loc.io.tum import read_tum, write_tum
 
 MODES = ("all", "out", "prev", "best", "robust")
@@ -454,3 +457,21 @@ def test_odometry_of_another_scale_is_noted(scale, told, log, tmp_path, capsys):
     write_tum(log / "T_odom_cam.tum", Trajectory(truth.stamps_ns, poses))
     assert main(["fuse", str(log), "--out", str(tmp_path / "run"), "--no-pictures"]) == 0
     assert ("times as long as those by which the objects pass" in capsys.readouterr().err) == told
+
+
+@pytest.mark.parametrize("command", ["localize", "fuse"])
+def test_quaternions_in_another_order_are_noted(command, log, tmp_path, capsys):
+    poses = read_log(log).object_poses[""]
+    rotation = Rotation.from_quat(np.roll(poses.T_cam_obj.rotation.as_quat(), 1, axis=1))
+    otherwise = replace(poses, T_cam_obj=make_pose(rotation, poses.T_cam_obj.translation))
+    write_object_poses(log / "object_poses.csv", otherwise)
+    main([command, str(log), "--out", str(tmp_path / "run"), *(["--no-pictures"] if command == "fuse" else [])])
+    assert "quaternions are written w, x, y, z" in capsys.readouterr().err
+
+
+def test_detections_behind_the_camera_are_noted(log, tmp_path, capsys):
+    poses = read_log(log).object_poses[""]
+    turned = make_pose(Rotation.from_rotvec([np.pi, 0.0, 0.0]), np.zeros(3))
+    write_object_poses(log / "object_poses.csv", replace(poses, T_cam_obj=turned * poses.T_cam_obj))
+    assert main(["localize", str(log), "--out", str(tmp_path / "run")]) == 0
+    assert "behind the camera" in capsys.readouterr().err
