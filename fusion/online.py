@@ -207,7 +207,8 @@ class Estimator:
         """
         stamp = operator.index(stamp_ns)
         rate, force = vector("angular_velocity", angular_velocity), vector("specific_force", specific_force)
-        if self._clock.was_set(stamp):
+        finite = math.isfinite(rate.dot(force))  # a broken sample's stamp says nothing of the clock
+        if finite and self._clock.was_set(stamp):
             self._clock_jumps += 1
             self._begin()
         self._feed_sample(stamp, rate, force)

@@ -138,6 +138,8 @@ def _camera(chain: Mapping[str, Any]) -> Camera | None:
     if model not in _COEFFICIENTS:
         raise FieldError(f"distortion_model is {model!r}: {', '.join(_COEFFICIENTS)} are known here")
     coefficients = _coefficients(chain.get("distortion_coeffs") or [])
+    if model == "none" and not any(coefficients):
+        coefficients = []  # written as zeros
     if len(coefficients) not in _COEFFICIENTS[model] and (len(coefficients) or model != "none"):
         raise FieldError(f"distortion_coeffs has {len(coefficients)} values, {model} needs {_COEFFICIENTS[model][0]}")
     return Camera(

@@ -30,14 +30,16 @@ def new(kind, log, options=None, **online):
     return kind(log.calibration, log.landmark_map, options, OnlineOptions(**online))
 
 
-def replay(estimator, log, until_s=np.inf, stamp=lambda ns: ns, covariance=None):
-    """Feed a log by stamps, up to a time since its start."""
+def replay(estimator, log, until_s=np.inf, stamp=lambda ns: ns, covariance=None, since_s=-np.inf):
+    """Feed a log by stamps, from after one time since its start up to another."""
     imu, poses, start = log.imu, log.object_poses[""], int(log.imu.stamps_ns[0])
     arrivals = [(int(t), 1, i) for i, t in enumerate(imu.stamps_ns)]
     arrivals += [(int(t), 0, int(t)) for t in np.unique(poses.stamps_ns)]
     for t, is_sample, which in sorted(arrivals):
         if t > start + until_s * 1e9:
             break
+        if t <= start + since_s * 1e9:
+            continue
         if is_sample:
             estimator.feed_imu(stamp(t), imu.angular_velocity[which], imu.specific_force[which])
             continue
@@ -89,6 +91,17 @@ def test_one_stamp_far_ahead_does_not_end_the_flight(kind, log):
     estimator.feed_imu(int(imu.stamps_ns[100]) + 86_400 * SECOND_NS, imu.angular_velocity[100], imu.specific_force[100])
     replay(estimator, log)
     assert estimator.state().stamp_ns == imu.stamps_ns[-1]
+    assert error_m(estimator, log) < 0.05
+
+
+@BOTH
+def test_the_stamp_of_a_broken_sample_says_nothing_of_the_clock(kind, log):
+    estimator, ahead = new(kind, log), int(log.imu.stamps_ns[0]) + 6 * SECOND_NS
+    replay(estimator, log, until_s=4.0)
+    estimator.feed_imu(ahead, np.full(3, np.nan), log.imu.specific_force[0])
+    replay(estimator, log, since_s=4.0)
+    assert estimator.health().clock_jumps == 0
+    assert estimator.health().malformed == 1
     assert error_m(estimator, log) < 0.05
 
 

@@ -89,6 +89,11 @@ def test_imu_alone(write, text):
     assert calibration == Calibration(imu=NOISE)
 
 
+def test_no_distortion_may_be_written_as_zeros(write):
+    none = GOLDEN.replace("radtan", "none").replace("[-0.28, 0.07, 1e-4, 2e-05]", "[0.0, 0, 0, 0]")
+    assert read_calibration(write(none)).camera.distortion_coeffs == ()
+
+
 def test_opencv_yaml_with_the_other_direction(write):
     calibration = read_calibration(write(OPENCV))
     np.testing.assert_allclose(calibration.T_cam_imu.inv().translation, [0.1, 0.2, 0.3], atol=1e-15)
