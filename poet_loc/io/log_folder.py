@@ -180,7 +180,11 @@ def _refuse_separate_spans(log: Log) -> None:
                     f"covers {start / 1e9:.3f} .. {end / 1e9:.3f} s, {other} {other_start / 1e9:.3f} .. "
                     f"{other_end / 1e9:.3f} s: no common time span"
                 )
-                raise InputError(what, path=log.path / file, fix="bring all stamps to one clock, in nanoseconds")
+                fix = "bring all stamps to one clock, in nanoseconds"
+                if log.calibration is not None and abs(log.calibration.timeshift_cam_imu_s) >= 1.0:
+                    shift = f"timeshift_cam_imu = {log.calibration.timeshift_cam_imu_s:g} s"
+                    fix += f"; with {shift} of calibration.yaml, which is in seconds"
+                raise InputError(what, path=log.path / file, fix=fix)
 
 
 def _spans_ns(log: Log) -> Iterator[tuple[str, int, int]]:

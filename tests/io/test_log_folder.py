@@ -152,7 +152,7 @@ def test_the_time_shift_counts_for_the_common_time_span(folder):
     write_log(folder, Log(folder, imu=imu, T_world_imu=truth, calibration=calibration))
     assert read_log(folder).calibration.timeshift_cam_imu_s == 100
     write_log(folder, Log(folder, calibration=replace(calibration, timeshift_cam_imu_s=-100.0)))
-    with pytest.raises(InputError, match="no common time span"):
+    with pytest.raises(InputError, match=r"no common time span.*timeshift_cam_imu = -100 s"):
         read_log(folder)
 
 
