@@ -38,7 +38,7 @@ from fusion.measurements import (
 from fusion.motion_source import odometry_spread, scaled_noise
 from fusion.nav_state import ACCEL_BIAS, CORE, GYRO_BIAS, POSITION, VELOCITY, StateLayout
 from fusion.noise_scale import widening
-from fusion.online_input import ImuClock, OnlineOptions, shaped, vector
+from fusion.online_input import ImuClock, OnlineOptions, shaped, vector, whole_numbers
 from fusion.options import FuseOptions
 from fusion.place_watch import (
     IN_A_ROW,
@@ -231,11 +231,11 @@ class Estimator:
         stamp_ns on the camera's clock; object_ids (N,), positions (N, 3) m, quaternions (N, 4) scalar last,
         covariances (N, 6, 6) of [e_r, e_t] in camera axes (None, or a row of NaN: from the options), instances (N,).
         Of one object, N may be left out. Objects that are not in the map are ignored and counted. Raises ValueError
-        for a zero quaternion and other shapes, InputError where options.measurements is camera.
+        for a zero quaternion, other shapes and ids, InputError where options.measurements is camera.
         """
         if self.options.measurements != "objects":
             raise InputError("this estimator fuses camera poses", fix="choose FuseOptions(measurements='objects')")
-        ids = np.atleast_1d(np.asarray(object_ids))
+        ids = whole_numbers("object_ids", object_ids)
         t, q = shaped("positions", positions, len(ids), 3), shaped("q_xyzw", q_xyzw, len(ids), 4)
         stated = None if covariances is None else shaped("covariances", covariances, len(ids), 6, 6)
         which = np.zeros(len(ids)) if instances is None else shaped("instances", instances, len(ids))

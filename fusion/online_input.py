@@ -58,6 +58,14 @@ def vector(name: str, values: ArrayLike) -> NDArray[np.float64]:
     return given
 
 
+def whole_numbers(name: str, values: ArrayLike) -> NDArray[np.int64]:
+    """Return a number or N of them as integers (N,); raises ValueError for what is none."""
+    given = np.atleast_1d(np.asarray(values))
+    if given.ndim > 1 or given.dtype.kind not in "iuf" or (given.dtype.kind == "f" and not (given % 1 == 0).all()):
+        raise ValueError(f"{name} must be whole numbers, not {values!r}")
+    return given.astype(np.int64)
+
+
 class ImuClock:
     """Notices stamps that are no nanoseconds, and a clock that was set back.
 

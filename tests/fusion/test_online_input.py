@@ -135,7 +135,12 @@ def test_arrays_of_another_shape_are_refused_and_not_read_across(kind, log):
         estimator.feed_imu(0, 0.0, [0.0, 0.0, 9.81])
     with pytest.raises(ValueError, match=r"specific_force.*\(3,\)"):
         estimator.feed_imu(0, [0.0, 0.0, 0.0], [[0.0, 0.0, 9.81]])
+    for wrong in ([1.7, 2.0], ["a", "b"], [[1, 2]], [np.nan, 1.0]):
+        with pytest.raises(ValueError, match="object_ids must be whole numbers"):
+            estimator.feed_object_poses(0, wrong, t, q)
     assert estimator.health().waiting == 0
+    estimator.feed_object_poses(0, np.array([1.0, 2.0]), t, q)
+    assert estimator.health().waiting == 2
 
 
 @BOTH
