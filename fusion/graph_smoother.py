@@ -36,7 +36,8 @@ class FixedLagSmoother:
 
     def __init__(self, builder: GraphBuilder, options: Graph) -> None:
         self.builder, self._options = builder, options
-        self._window = max(1, round(options.lag_s * options.keyframe_rate_hz))
+        least = 2 if options.relinearize_every else 1  # of one keyframe nothing is left to be linearised anew
+        self._window = max(least, round(options.lag_s * options.keyframe_rate_hz))
         self._isam = gtsam.ISAM2(isam_parameters(options))
         self._came: dict[int, list[int]] = {}  # per keyframe, what does not last
         self._lasting: dict[int, None] = {}

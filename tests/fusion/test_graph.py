@@ -19,7 +19,7 @@ from fusion.graph_motion import MotionChain
 from fusion.graph_smoother import FixedLagSmoother, detection_of, joint_covariance
 from fusion.graph_walk import Walk
 from fusion.options import DetectionBias, Estimate, FuseOptions, Graph
-from fusion.simulate import Displacement, SimulationOptions, simulate_with_truth
+from fusion.simulate import Displacement, SimulationOptions, simulate, simulate_with_truth
 from poet_loc.core.consistency import pose_nees
 from poet_loc.core.input_error import InputError
 
@@ -331,3 +331,14 @@ def test_a_graph_without_a_solution_ends_in_one_line(estimator, monkeypatch):
     monkeypatch.setattr(graph, "run_batch" if estimator == "batch" else "run_fixed_lag", indeterminate)
     with pytest.raises(InputError, match=r"Indeterminate linear system detected while .*; see what fuse/eskf does"):
         graph.run_graph(simulated(), FuseOptions(estimator=estimator))
+
+
+@pytest.mark.parametrize("seed", [0, 2])
+def test_a_graph_without_a_lag_is_linearised_anew_as_well(seed):
+    """With neither biases nor an IMU nothing lasts beyond a keyframe, of which alone gtsam lost its variables."""
+    rates = {"imu_rate_hz": 100.0, "camera_rate_hz": 10.0}
+    log = simulate(SimulationOptions(duration_s=6.0, seed=seed, objects=1, symmetric_objects=0, odometry=True, **rates))
+    without = FuseOptions("graph", motion="odometry", bias=DetectionBias(use=False), graph=Graph(lag_s=0.0))
+    anew = replace(without, graph=replace(without.graph, relinearize_every=1))
+    T, same = fuse(log, anew).T_world_imu, fuse(log, without).T_world_imu
+    assert np.linalg.norm(T.translation - same.translation, axis=1).max() < 0.01
