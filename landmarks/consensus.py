@@ -22,6 +22,7 @@ def agreement(votes: Votes, distance: float, angle: float) -> Mask:
     apart = np.linalg.norm(votes.t_world_cam[:, :, None] - votes.t_world_cam[:, None], axis=-1)
     trace = np.einsum("faij,fbij->fab", votes.R_world_cam, votes.R_world_cam)
     near = (apart <= distance) & (rotation_angle(trace) <= angle)
+    near |= np.eye(near.shape[-1], dtype=bool)  # whatever rounding makes of the angle from a vote to itself
     return near & votes.valid[:, :, None] & votes.valid[:, None]
 
 

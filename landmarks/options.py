@@ -88,7 +88,8 @@ class SolverOptions:
         within("[0, 1]", self, "memory.white_share")
         within("(0, inf)", self, "noise.rotation_deg")
         within("[0, inf)", self, "noise.across", "noise.along", "noise.least")
-        within("[0, inf]", self, "distance", "angle_deg", "memory.evidence_s", "memory.hold_s")
+        within("(0, inf]", self, "distance", "angle_deg")
+        within("[0, inf]", self, "memory.evidence_s", "memory.hold_s")
         within("[0, inf)", self, "memory.speed", "memory.turn_rate_deg")
         if self.noise.least + min(self.noise.across, self.noise.along) == 0.0:
             raise InputError("noise.least is 0 and so is another part of the noise", fix="give one of them more than 0")

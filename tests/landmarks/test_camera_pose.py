@@ -192,6 +192,9 @@ def test_mistakes_and_empty_input() -> None:
         solve(poses, landmarks, SolverOptions(mode="best"))
     with pytest.raises(InputError, match="mode is 'median'; choose among all, out"):
         solve(poses, landmarks, SolverOptions(mode="median"))  # type: ignore[arg-type]
+    for threshold in ("distance", "angle_deg"):  # differences are counted in them
+        with pytest.raises(InputError, match=r"is 0\.0; give more than 0"):
+            SolverOptions(**{threshold: 0.0})
     for mode in MODES:
         for nothing, world in ((poses[:0], landmarks), (poses, LandmarkMap())):
             estimates = solve(nothing, world, SolverOptions(mode=mode), truth)

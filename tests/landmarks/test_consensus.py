@@ -76,6 +76,15 @@ def test_agreement_is_within_distance_and_angle() -> None:
         np.testing.assert_array_equal(agree[:, i, j], both & (angle <= np.radians(7.0)) & (apart <= 0.08))
 
 
+def test_a_vote_agrees_with_itself_however_small_the_thresholds_are() -> None:
+    rng = np.random.default_rng(1)
+    landmarks, truth = make_map(rng, range(6)), fly_around(rng, 200)
+    poses = detect(truth, landmarks, small_errors(rng, 200, 6, 3.0), rng.random((200, 6)) < 0.5)
+    votes = votes_of(poses, landmarks)
+    np.testing.assert_array_equal(agreement(votes, 1e-12, 1e-12), votes.valid[:, :, None] & np.eye(6, dtype=bool))
+    assert len(solve(poses, landmarks, SolverOptions(mode="out", angle_deg=1e-9)).camera_poses) == len(votes)
+
+
 @pytest.mark.parametrize("weights", ["equal", "score"])
 def test_means_against_scipy_and_the_definition(weights: str) -> None:
     rng = np.random.default_rng(1)
