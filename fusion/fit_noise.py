@@ -48,7 +48,8 @@ class FitNoiseOptions:
     """An object with fewer good detections in a log is left out."""
 
     def __post_init__(self) -> None:
-        within("(0, inf]", self, "gross_distance", "gross_angle_deg", "longest_lag_s")
+        within("(0, inf]", self, "gross_distance", "gross_angle_deg")
+        within("(0, inf)", self, "longest_lag_s")
         within("[2, inf]", self, "min_detections")
 
 
@@ -111,7 +112,7 @@ def fit_noise(
     options = options or FitNoiseOptions()
     lags = (np.arange(1, max(2, round(options.longest_lag_s / _STEP_S))) * _STEP_S).astype(np.float64)
     sums, counts = np.zeros((6, len(lags) + 1)), np.zeros(len(lags) + 1)
-    found, seen, scatters = _good_errors(logs, detections, options)
+    found, gross_share, scatters = _good_errors(logs, detections, options)
     good = sum(len(stamps) for tracks in found.values() for stamps, _ in tracks)
     if good == 0:
         raise InputError(f"no object has {options.min_detections} good detections", fix="give longer logs")
@@ -126,7 +127,7 @@ def fit_noise(
     covariance = sums / np.maximum(counts, 1)
     usable = np.r_[True, counts[1:] > options.min_detections]
     parts = {name: _fit_part(covariance[part], lags, usable) for name, part in PARTS.items()}
-    return FittedNoise(parts, 1.0 - good / seen, good, _usual_scatter(scatters), means)
+    return FittedNoise(parts, gross_share, good, _usual_scatter(scatters), means)
 
 
 def _row_of_means(object_id: int, mean: Array) -> tuple[int, float, float, float, float, float, float]:
@@ -136,20 +137,21 @@ def _row_of_means(object_id: int, mean: Array) -> tuple[int, float, float, float
 
 def _good_errors(
     logs: Iterable[Log], detections: str | None, options: FitNoiseOptions
-) -> tuple[dict[int, list[Track]], int, list[Array]]:
-    """Return by object id what is no gross error, log by log, how many detections there are, and how they scatter."""
+) -> tuple[dict[int, list[Track]], float, list[Array]]:
+    """Return by object id what is no gross error, log by log, what share of all is one, and how they scatter."""
     found: dict[int, list[Track]] = {}
-    seen, scatters = 0, []
+    seen, gross, scatters = 0, 0, []
     for log in logs:
         poses = log.detections(detections)[1]
         for object_id, stamps, errors in object_errors(log, poses):
             keep = is_good(errors, options)
             seen += len(keep)
+            gross += int(np.count_nonzero(~keep))
             if np.count_nonzero(keep) >= options.min_detections:
                 found.setdefault(object_id, []).append((stamps[keep], errors[keep]))
                 if poses.covariances is None:  # else what they state sizes their biases
                     scatters.append(scatter_of(stamps, errors))
-    return found, seen, scatters
+    return found, gross / max(seen, 1), scatters
 
 
 def _usual_scatter(scatters: list[Array]) -> Array:

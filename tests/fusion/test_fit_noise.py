@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from fusion.fit_noise import fit_noise
+from fusion.fit_noise import FitNoiseOptions, fit_noise
 from poet_loc.core.geometry import make_pose
 from poet_loc.core.input_error import InputError
 from poet_loc.core.records import Landmark, LandmarkMap, ObjectPoses
@@ -20,6 +20,7 @@ WHITE = np.array([0.03, 0.03, 0.03, 0.004, 0.004, 0.015])
 VARYING = np.array([0.05, 0.05, 0.05, 0.006, 0.006, 0.03])
 TAU = np.array([4.0, 4.0, 4.0, 2.0, 2.0, 1.0])
 
+TABLE_COLUMNS = ("stamps_ns", "frames", "object_ids", "instances", "scores")
 
 MEANS = {1: np.array([0.05, -0.08, 0.02, 0.004, 0.01, -0.04]), 2: np.array([-0.03, 0.04, 0.0, -0.006, 0.008, 0.03])}
 SCATTER = np.array([0.01, 0.01, 0.01, 0.001, 0.001, 0.004])
@@ -72,9 +73,25 @@ def test_gross_errors_are_counted_and_left_out():
     assert found.parts["along"].white == pytest.approx(clean.parts["along"].white, rel=0.1)
 
 
+def test_detections_that_are_too_few_to_fit_are_no_gross_errors():
+    log, few = made_log(0, 1000), made_log(1, 60, object_id=2)
+    poses, others = log.object_poses[""], few.object_poses[""]
+    order = np.argsort(np.r_[poses.stamps_ns, others.stamps_ns], kind="stable")
+    columns = {name: np.r_[getattr(poses, name), getattr(others, name)][order] for name in TABLE_COLUMNS}
+    T_cam_obj = RigidTransform.concatenate([poses.T_cam_obj, others.T_cam_obj])[order]
+    world = LandmarkMap((*log.landmark_map, *few.landmark_map))
+    fitted = fit_noise(
+        [replace(log, object_poses={"": ObjectPoses(**columns, T_cam_obj=T_cam_obj)}, landmark_map=world)]
+    )
+    assert fitted.detections == 1000
+    assert fitted.gross_share == 0.0
+
+
 def test_without_ground_truth_there_is_nothing_to_fit():
     with pytest.raises(InputError, match="T_world_cam"):
         fit_noise([replace(made_log(0, 200), T_world_cam=None)])
+    with pytest.raises(InputError, match="longest-lag-s is inf; give more than 0 and less than inf"):
+        FitNoiseOptions(longest_lag_s=np.inf)
 
 
 def test_real_networks_err_mostly_in_depth_and_for_long(shared_data):
