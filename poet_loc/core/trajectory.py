@@ -41,6 +41,10 @@ class Trajectory:
         """Return the trajectory of another frame fixed to the body."""
         return Trajectory(self.stamps_ns, self.T_world_body * T_body_other)
 
+    def later(self, by_ns: int) -> Trajectory:
+        """Return the same poses with stamps that are later by so much: on a clock that is ahead."""
+        return Trajectory(self.stamps_ns + by_ns, self.T_world_body)
+
     def interpolate(self, stamps_ns: Stamps, max_gap_ns: int | None = None) -> tuple[RigidTransform, NDArray[np.bool_]]:
         """Return the poses at other stamps, along the SE(3) geodesic between neighbours, and which are valid.
 

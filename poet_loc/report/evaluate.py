@@ -44,6 +44,8 @@ class Estimate:
     runtime_s: float | None = None
     oracle: bool = False
     """Whether it looked at the ground truth."""
+    on_imu_clock: bool = False
+    """Whether its stamps are the IMU's: t_imu = t_cam + timeshift_cam_imu."""
 
     @classmethod
     def of_camera_poses(
@@ -57,7 +59,7 @@ class Estimate:
     def of_fused(cls, fused: Fused) -> Estimate:
         """Return the estimate that a fused trajectory is."""
         trajectory = Trajectory(fused.stamps_ns, fused.T_world_imu)
-        return cls(fused.name, trajectory, "imu", fused.pose_covariances, fused.runtime_s)
+        return cls(fused.name, trajectory, "imu", fused.pose_covariances, fused.runtime_s, on_imu_clock=True)
 
 
 @dataclass(frozen=True)
@@ -251,15 +253,18 @@ def pool(evaluations: Iterable[Evaluation]) -> Evaluation:
 
 
 def references_for_both_bodies(
-    references: Mapping[Body, Trajectory], T_cam_imu: RigidTransform | None
+    references: Mapping[Body, Trajectory], T_cam_imu: RigidTransform | None, timeshift_ns: int = 0
 ) -> dict[Body, Trajectory]:
-    """Return the ground truth of camera and IMU, the missing one by way of the extrinsics where they are known."""
+    """Return the ground truth of camera and IMU, the missing one by way of the extrinsics where they are known.
+
+    Each is on its sensor's own clock: t_imu = t_cam + timeshift.
+    """
     both = dict(references)
     if T_cam_imu is not None:
         if "cam" in both and "imu" not in both:
-            both["imu"] = both["cam"].to_body(T_cam_imu)
+            both["imu"] = both["cam"].to_body(T_cam_imu).later(timeshift_ns)
         elif "imu" in both and "cam" not in both:
-            both["cam"] = both["imu"].to_body(T_cam_imu.inv())
+            both["cam"] = both["imu"].to_body(T_cam_imu.inv()).later(-timeshift_ns)
     return both
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -22,13 +23,17 @@ from poet_loc.report.evaluate import (
 
 
 def references_of(log: Log) -> dict[Body, Trajectory]:
-    """Return the ground truth of camera and IMU that a log has, the missing one by way of T_cam_imu."""
+    """Return the ground truth of camera and IMU that a log has, the missing one by way of T_cam_imu.
+
+    The camera's is on the camera's clock, the IMU's on the IMU's.
+    """
     there: dict[Body, Trajectory] = {}
     if log.T_world_cam is not None:
         there["cam"] = log.T_world_cam
     if log.T_world_imu is not None:
         there["imu"] = log.T_world_imu
-    return references_for_both_bodies(there, None if log.calibration is None else log.calibration.T_cam_imu)
+    T_cam_imu = None if log.calibration is None else log.calibration.T_cam_imu
+    return references_for_both_bodies(there, T_cam_imu, _timeshift_ns(log))
 
 
 def evaluate_log(
@@ -36,12 +41,15 @@ def evaluate_log(
 ) -> Evaluation | None:
     """Return the errors of those estimates whose body the log has ground truth for; None where it has for none.
 
-    detections names the set whose stamps are the sensor's; None: the log's camera poses.
+    detections names the set whose stamps are the sensor's; None: the log's camera poses. All is compared on the
+    camera's clock.
     """
-    references = references_of(log)
-    known = [estimate for estimate in estimates if estimate.body in references]
+    references, shift_ns = references_of(log), _timeshift_ns(log)
+    known = [_on_camera_clock(estimate, shift_ns) for estimate in estimates if estimate.body in references]
     if not known:
         return None
+    if "imu" in references:
+        references["imu"] = references["imu"].later(-shift_ns)
     source = log.camera_poses if detections is None else log.object_poses[detections]
     assert source is not None
     sensor_ns = np.asarray(source.stamps_ns)
@@ -58,6 +66,17 @@ def evaluate_log(
         frames_ns, frames_of = np.union1d(frames_ns, missed_ns), f"{frames_of} and, in its long gaps, {truth_file}"
     span_ns = (int(sensor_ns.min()), int(sensor_ns.max()))
     return evaluate(known, references, span_ns, options, frames_ns, frames_of)
+
+
+def _timeshift_ns(log: Log) -> int:
+    """Return what turns a camera stamp into an IMU stamp."""
+    return 0 if log.calibration is None else round(log.calibration.timeshift_cam_imu_s * 1e9)
+
+
+def _on_camera_clock(estimate: Estimate, shift_ns: int) -> Estimate:
+    if not estimate.on_imu_clock:
+        return estimate
+    return replace(estimate, trajectory=estimate.trajectory.later(-shift_ns))
 
 
 def _file_of(detections: str | None) -> str:

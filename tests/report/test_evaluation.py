@@ -13,7 +13,9 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from poet_loc.core.geometry import make_pose
 from poet_loc.core.input_error import InputError
+from poet_loc.core.records import Calibration, CameraPoses
 from poet_loc.core.trajectory import Trajectory
+from poet_loc.io.log_folder import Log
 from poet_loc.report.evaluate import (
     Estimate,
     EvaluateOptions,
@@ -23,6 +25,7 @@ from poet_loc.report.evaluate import (
     references_for_both_bodies,
     stamps_in_gaps,
 )
+from poet_loc.report.log_evaluation import evaluate_log
 from poet_loc.report.summary import inside_3_sigma, read_summary, to_summary, write_errors_csv, write_summary
 
 START_NS = 1_600_049_000_000_000_000
@@ -248,6 +251,35 @@ def test_the_other_bodys_truth_follows_from_the_extrinsics() -> None:
     back = references_for_both_bodies({"imu": imu}, T_cam_imu)["cam"]
     np.testing.assert_allclose(back.T_world_body.as_matrix(), CAMERA.T_world_body.as_matrix(), atol=1e-12)
     assert set(references_for_both_bodies({"cam": CAMERA}, None)) == {"cam"}
+
+
+@pytest.mark.parametrize("known", [("cam", "imu"), ("cam",), ("imu",)])
+@pytest.mark.parametrize("timeshift_s", [0.08, -0.013])
+def test_errors_are_between_poses_of_one_moment_whatever_separates_the_clocks(
+    timeshift_s: float, known: tuple[str, ...]
+) -> None:
+    T_cam_imu = RigidTransform.from_exp_coords([0.1, 0.2, 0.3, 0.1, 0.2, 0.3])
+    shift_ns = round(timeshift_s * 1e9)
+
+    def of_imu(on_imu_clock: np.ndarray) -> Trajectory:
+        return Trajectory(on_imu_clock, motion(on_imu_clock - shift_ns).T_world_body * T_cam_imu)
+
+    truths = {"T_world_cam": CAMERA, "T_world_imu": of_imu(stamps(200.0, 400))}
+    seen = CameraPoses(CAMERA.stamps_ns, np.arange(60), CAMERA.T_world_body)
+    log = Log(
+        Path("made"),
+        camera_poses=seen,
+        calibration=Calibration(T_cam_imu=T_cam_imu, timeshift_cam_imu_s=timeshift_s),
+        **{name: each for name, each in truths.items() if name[8:] in known},
+    )
+    followed = of_imu(stamps(200.0, 400, timeshift_s))
+    estimates = [cam("given", CAMERA), Estimate("fused", followed, "imu", on_imu_clock=True)]
+    evaluation = evaluate_log(log, None, estimates, EvaluateOptions())
+    assert evaluation is not None
+    for row in evaluation.rows:
+        assert row.coverage > 0.95
+        assert np.abs(row.errors).max() < 1e-4
+        assert np.isin(row.stamps_ns, CAMERA.stamps_ns).all() or known == ("imu",)
 
 
 def test_what_cannot_be_compared_says_so() -> None:
