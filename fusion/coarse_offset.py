@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from dataclasses import replace
 
 from fusion.options import FuseOptions
-from fusion.prepare import WITH_IMU, Problem, time_shift_ns
+from fusion.prepare import WITH_IMU, Problem
 from poet_loc.core.records import Calibration, CameraPoses, ObjectPoses
 from poet_loc.core.turn_match import Match, match_turns
 from poet_loc.core.turn_rates import PoseStream, turn_rates
@@ -60,6 +60,6 @@ def with_coarse_offset(
 def retimed(problem: Problem, timeshift_cam_imu_s: float) -> Problem:
     """Return the problem with another time offset in its calibration."""
     calibration = replace(problem.calibration, timeshift_cam_imu_s=timeshift_cam_imu_s)
-    later = time_shift_ns(calibration) - time_shift_ns(problem.calibration)
+    later = calibration.timeshift_ns - problem.calibration.timeshift_ns
     measured = replace(problem.measurements, stamps_ns=problem.measurements.stamps_ns + later)
     return replace(problem, calibration=calibration, measurements=measured)

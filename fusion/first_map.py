@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from fusion.options import FuseOptions
-from fusion.prepare import NEAREST_OBJECT, time_shift_ns
+from fusion.prepare import NEAREST_OBJECT
 from poet_loc.core.geometry import make_pose
 from poet_loc.core.records import Calibration, ImuSamples, Landmark, LandmarkMap, ObjectPoses
 from poet_loc.io.log_folder import Log
@@ -61,7 +61,7 @@ def _upright(seen: ObjectPoses, imu: ImuSamples | None, calibration: Calibration
     """Return the smallest turn of the object after which the specific force points along z."""
     if imu is None or calibration.T_cam_imu is None:
         return Rotation.identity()
-    stamps = seen.stamps_ns + time_shift_ns(calibration)
+    stamps = seen.stamps_ns + calibration.timeshift_ns
     inside = (stamps >= imu.stamps_ns[0]) & (stamps <= imu.stamps_ns[-1])
     if not inside.any():
         return Rotation.identity()

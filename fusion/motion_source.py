@@ -106,7 +106,7 @@ def _odometry_of(log: Log) -> Trajectory:
 
 
 def _on_imu_clock(T_odom_cam: Trajectory, calibration: Calibration) -> Trajectory:
-    return replace(T_odom_cam, stamps_ns=T_odom_cam.stamps_ns + round(calibration.timeshift_cam_imu_s * 1e9))
+    return T_odom_cam.later(calibration.timeshift_ns)
 
 
 def _imu(log: Log, calibration: Calibration, options: FuseOptions) -> MotionSource:

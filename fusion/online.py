@@ -51,7 +51,7 @@ from fusion.place_watch import (
     STATUS,
     TESTED,
 )
-from fusion.prepare import NEAREST_OBJECT, Problem, fill_memory, layout_for, time_shift_ns
+from fusion.prepare import NEAREST_OBJECT, Problem, fill_memory, layout_for
 from poet_loc.core.geometry import make_pose
 from poet_loc.core.input_error import InputError
 from poet_loc.core.records import Calibration, ImuSamples, LandmarkMap
@@ -155,7 +155,7 @@ class Estimator:
         self.layout, self.keys = problem.layout, problem.keys
         self._floats, self._integers = fill_memory(problem, self.options)
         self.memory = memory.views.py_func(self._floats, self._integers)
-        self._problem, self._shift_ns = problem, time_shift_ns(calibration)
+        self._problem, self._shift_ns = problem, calibration.timeshift_ns
         self._landmarks = _landmark_numbers(self.keys)
         self._known_errors = known_errors(self.options.bias, landmark_map)
         noise = self.options.camera_noise

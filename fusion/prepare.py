@@ -154,7 +154,7 @@ def object_measurements(
         given = np.isfinite(poses.covariances).all(axis=(1, 2))
         covariances[given] = white_part(poses.covariances[given], t[given], noise, options.bias)
     return Measurements(
-        poses.stamps_ns + time_shift_ns(calibration),
+        poses.stamps_ns + calibration.timeshift_ns,
         np.full(len(poses), OBJECT_POSE, dtype=np.int64),
         landmark,
         R.as_matrix().reshape(-1, 9),
@@ -182,18 +182,13 @@ def camera_measurements(
     if lasting_s > 0.0 and len(stamps) > 1:
         covariances /= np.tanh(0.5e-9 * np.median(np.diff(stamps)) / lasting_s)
     return Measurements(
-        poses.stamps_ns + time_shift_ns(calibration),
+        poses.stamps_ns + calibration.timeshift_ns,
         np.full(len(poses), CAMERA_POSE, dtype=np.int64),
         np.full(len(poses), -1, dtype=np.int64),
         poses.T_world_cam.rotation.as_matrix().reshape(-1, 9),
         np.ascontiguousarray(poses.T_world_cam.translation),
         covariances,
     )
-
-
-def time_shift_ns(calibration: Calibration) -> int:
-    """Return what turns a camera stamp into an IMU stamp."""
-    return round(calibration.timeshift_cam_imu_s * 1e9)
 
 
 def layout_for(landmark_map: LandmarkMap | None, options: FuseOptions) -> StateLayout:

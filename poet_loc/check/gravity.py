@@ -82,7 +82,7 @@ def _imu_attitudes(log: Log) -> Iterator[tuple[str, Trajectory]]:
         yield "T_world_imu.tum", log.T_world_imu
     if log.calibration is None or log.calibration.T_cam_imu is None:
         return
-    T_cam_imu, shift = log.calibration.T_cam_imu, round(log.calibration.timeshift_cam_imu_s * 1e9)
+    T_cam_imu, shift = log.calibration.T_cam_imu, log.calibration.timeshift_ns
     if log.T_world_cam is not None:
         yield "T_world_cam.tum", Trajectory(log.T_world_cam.stamps_ns + shift, log.T_world_cam.T_world_body * T_cam_imu)
     if log.camera_poses is not None:

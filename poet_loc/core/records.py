@@ -99,6 +99,11 @@ class Calibration:
     camera: Camera | None = None
     imu: ImuNoise | None = None
 
+    @property
+    def timeshift_ns(self) -> int:
+        """What turns a camera stamp into an IMU stamp."""
+        return round(self.timeshift_cam_imu_s * 1e9)
+
 
 @dataclass(frozen=True)
 class Symmetry:

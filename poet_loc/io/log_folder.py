@@ -189,8 +189,7 @@ def _refuse_separate_spans(log: Log) -> None:
 
 def _spans_ns(log: Log) -> Iterator[tuple[str, int, int]]:
     """Yield file, first and last stamp of each stream, on the camera's clock."""
-    timeshift = log.calibration.timeshift_cam_imu_s if log.calibration else 0.0
-    shift_ns = round(timeshift * 1e9)  # t_imu = t_cam + timeshift
+    shift_ns = log.calibration.timeshift_ns if log.calibration else 0
     streams: list[tuple[str, Stamps | None, int]] = [
         *((object_poses_file(name), poses.stamps_ns, 0) for name, poses in log.object_poses.items()),
         ("camera_poses.csv", None if log.camera_poses is None else log.camera_poses.stamps_ns, 0),

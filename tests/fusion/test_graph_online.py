@@ -15,7 +15,6 @@ from fusion.graph_online import GraphEstimator
 from fusion.measurements import CAMERA_POSE, Measurements
 from fusion.online_input import OnlineOptions
 from fusion.options import DetectionBias, Estimate, FuseOptions, Graph
-from fusion.prepare import time_shift_ns
 
 OPTIONS = FuseOptions(estimator="graph", graph=Graph(lag_s=0.8))
 
@@ -35,7 +34,7 @@ class Feed:
 
     def pose(self, j):
         m = self.problem.measurements
-        stamp = int(m.stamps_ns[j]) - time_shift_ns(self.problem.calibration)
+        stamp = int(m.stamps_ns[j]) - self.problem.calibration.timeshift_ns
         q = Rotation.from_matrix(m.rotations[j].reshape(3, 3)).as_quat()
         if m.kinds[j] == CAMERA_POSE:
             self.estimator.feed_camera_pose(stamp, m.translations[j], q, m.covariances[j])

@@ -41,7 +41,7 @@ def feed(estimator: Estimator, problem: Problem, event: tuple[int, int, int]) ->
         imu = problem.imu
         estimator.feed_imu(imu.stamps_ns[index], imu.angular_velocity[index], imu.specific_force[index])
         return
-    m, shift = problem.measurements, round(problem.calibration.timeshift_cam_imu_s * 1e9)
+    m, shift = problem.measurements, problem.calibration.timeshift_ns
     rows = np.flatnonzero(m.stamps_ns == index)
     q = Rotation.from_matrix(m.rotations[rows].reshape(-1, 3, 3)).as_quat()
     if m.kinds[rows[0]] == CAMERA_POSE:
