@@ -13,7 +13,7 @@ from scipy.spatial.transform import RigidTransform
 from poet_loc.core.consistency import pose_nees
 from poet_loc.core.errors import attitude_error, position_error, rotation_angle
 from poet_loc.core.input_error import InputError, within
-from poet_loc.core.records import CameraPoses
+from poet_loc.core.records import Calibration, CameraPoses
 from poet_loc.core.trajectory import Trajectory, nearest_stamps
 from poet_loc.report.fused import Fused
 
@@ -46,6 +46,8 @@ class Estimate:
     """Whether it looked at the ground truth."""
     on_imu_clock: bool = False
     """Whether its stamps are the IMU's: t_imu = t_cam + timeshift_cam_imu."""
+    timeshift_cam_imu_s: float | None = None
+    """As it found it; None: it took the calibration's."""
 
     @classmethod
     def of_camera_poses(
@@ -59,7 +61,8 @@ class Estimate:
     def of_fused(cls, fused: Fused) -> Estimate:
         """Return the estimate that a fused trajectory is."""
         trajectory = Trajectory(fused.stamps_ns, fused.T_world_imu)
-        return cls(fused.name, trajectory, "imu", fused.pose_covariances, fused.runtime_s, on_imu_clock=True)
+        found = None if fused.calibrated is None else fused.calibrated.timeshift_cam_imu_s
+        return cls(fused.name, trajectory, "imu", fused.pose_covariances, fused.runtime_s, False, True, found)
 
 
 @dataclass(frozen=True)
@@ -253,18 +256,18 @@ def pool(evaluations: Iterable[Evaluation]) -> Evaluation:
 
 
 def references_for_both_bodies(
-    references: Mapping[Body, Trajectory], T_cam_imu: RigidTransform | None, timeshift_ns: int = 0
+    references: Mapping[Body, Trajectory], calibration: Calibration
 ) -> dict[Body, Trajectory]:
     """Return the ground truth of camera and IMU, the missing one by way of the extrinsics where they are known.
 
-    Each is on its sensor's own clock: t_imu = t_cam + timeshift.
+    Each is on its sensor's own clock.
     """
-    both = dict(references)
+    both, T_cam_imu = dict(references), calibration.T_cam_imu
     if T_cam_imu is not None:
         if "cam" in both and "imu" not in both:
-            both["imu"] = both["cam"].to_body(T_cam_imu).later(timeshift_ns)
+            both["imu"] = both["cam"].to_body(T_cam_imu).later(calibration.timeshift_ns)
         elif "imu" in both and "cam" not in both:
-            both["cam"] = both["imu"].to_body(T_cam_imu.inv()).later(-timeshift_ns)
+            both["cam"] = both["imu"].to_body(T_cam_imu.inv()).later(-calibration.timeshift_ns)
     return both
 
 

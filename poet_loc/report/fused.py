@@ -57,6 +57,10 @@ class Calibrated(Protocol):
     def landmark_map(self) -> LandmarkMap | None:
         """The map as it was found; None where it was taken as given."""
 
+    @property
+    def timeshift_cam_imu_s(self) -> float | None:
+        """The time offset as it was found, likewise."""
+
 
 class HasStates(Protocol):
     """What states.csv holds of a fused result, at N stamps."""

@@ -32,8 +32,7 @@ def references_of(log: Log) -> dict[Body, Trajectory]:
         there["cam"] = log.T_world_cam
     if log.T_world_imu is not None:
         there["imu"] = log.T_world_imu
-    T_cam_imu = None if log.calibration is None else log.calibration.T_cam_imu
-    return references_for_both_bodies(there, T_cam_imu, _timeshift_ns(log))
+    return there if log.calibration is None else references_for_both_bodies(there, log.calibration)
 
 
 def evaluate_log(
@@ -42,10 +41,11 @@ def evaluate_log(
     """Return the errors of those estimates whose body the log has ground truth for; None where it has for none.
 
     detections names the set whose stamps are the sensor's; None: the log's camera poses. All is compared on the
-    camera's clock.
+    camera's clock; what an estimate found of it counts where the IMU's ground truth is made of the camera's.
     """
-    references, shift_ns = references_of(log), _timeshift_ns(log)
-    known = [_on_camera_clock(estimate, shift_ns) for estimate in estimates if estimate.body in references]
+    references, shift_ns = references_of(log), 0 if log.calibration is None else log.calibration.timeshift_ns
+    as_found = log.T_world_imu is None
+    known = [_on_camera_clock(each, shift_ns, as_found) for each in estimates if each.body in references]
     if not known:
         return None
     if "imu" in references:
@@ -68,14 +68,11 @@ def evaluate_log(
     return evaluate(known, references, span_ns, options, frames_ns, frames_of)
 
 
-def _timeshift_ns(log: Log) -> int:
-    """Return what turns a camera stamp into an IMU stamp."""
-    return 0 if log.calibration is None else round(log.calibration.timeshift_cam_imu_s * 1e9)
-
-
-def _on_camera_clock(estimate: Estimate, shift_ns: int) -> Estimate:
+def _on_camera_clock(estimate: Estimate, shift_ns: int, as_found: bool) -> Estimate:
     if not estimate.on_imu_clock:
         return estimate
+    if as_found and estimate.timeshift_cam_imu_s is not None:
+        shift_ns = round(estimate.timeshift_cam_imu_s * 1e9)
     return replace(estimate, trajectory=estimate.trajectory.later(-shift_ns))
 
 

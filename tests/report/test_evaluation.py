@@ -247,18 +247,19 @@ def test_where_the_truth_is_missing_it_is_said_why() -> None:
 
 def test_the_other_bodys_truth_follows_from_the_extrinsics() -> None:
     T_cam_imu = RigidTransform.from_exp_coords([0.1, 0.2, 0.3, 1.0, 2.0, 3.0])
-    imu = references_for_both_bodies({"cam": CAMERA}, T_cam_imu)["imu"]
-    back = references_for_both_bodies({"imu": imu}, T_cam_imu)["cam"]
+    imu = references_for_both_bodies({"cam": CAMERA}, Calibration(T_cam_imu))["imu"]
+    back = references_for_both_bodies({"imu": imu}, Calibration(T_cam_imu))["cam"]
     np.testing.assert_allclose(back.T_world_body.as_matrix(), CAMERA.T_world_body.as_matrix(), atol=1e-12)
-    assert set(references_for_both_bodies({"cam": CAMERA}, None)) == {"cam"}
+    assert set(references_for_both_bodies({"cam": CAMERA}, Calibration())) == {"cam"}
 
 
 @pytest.mark.parametrize("known", [("cam", "imu"), ("cam",), ("imu",)])
-@pytest.mark.parametrize("timeshift_s", [0.08, -0.013])
+@pytest.mark.parametrize(("stated_s", "found_s"), [(0.08, None), (-0.013, None), (0.03, 0.08)])
 def test_errors_are_between_poses_of_one_moment_whatever_separates_the_clocks(
-    timeshift_s: float, known: tuple[str, ...]
+    stated_s: float, found_s: float | None, known: tuple[str, ...]
 ) -> None:
     T_cam_imu = RigidTransform.from_exp_coords([0.1, 0.2, 0.3, 0.1, 0.2, 0.3])
+    timeshift_s = stated_s if found_s is None else found_s
     shift_ns = round(timeshift_s * 1e9)
 
     def of_imu(on_imu_clock: np.ndarray) -> Trajectory:
@@ -269,12 +270,13 @@ def test_errors_are_between_poses_of_one_moment_whatever_separates_the_clocks(
     log = Log(
         Path("made"),
         camera_poses=seen,
-        calibration=Calibration(T_cam_imu=T_cam_imu, timeshift_cam_imu_s=timeshift_s),
+        calibration=Calibration(T_cam_imu, stated_s),
         **{name: each for name, each in truths.items() if name[8:] in known},
     )
     followed = of_imu(stamps(200.0, 400, timeshift_s))
-    estimates = [cam("given", CAMERA), Estimate("fused", followed, "imu", on_imu_clock=True)]
-    evaluation = evaluate_log(log, None, estimates, EvaluateOptions())
+    fused = Estimate("fused", followed, "imu", on_imu_clock=True, timeshift_cam_imu_s=found_s)
+    given = [] if "cam" not in known and found_s is not None else [cam("given", CAMERA)]  # nobody tells its clock
+    evaluation = evaluate_log(log, None, [*given, fused], EvaluateOptions())
     assert evaluation is not None
     for row in evaluation.rows:
         assert row.coverage > 0.95
