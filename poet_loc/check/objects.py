@@ -61,19 +61,23 @@ def check_in_front(log: Log) -> Iterator[Finding]:
 
     Where all are, and objects lie beside each other as in the map, it is another camera's axes: OpenGL's, it seems.
     """
-    misfits = _misfits(log)
     for name, poses in log.object_poses.items():
         behind = poses.T_cam_obj.translation[:, 2] <= 0.0
         if np.count_nonzero(behind) < _LEAST_BEHIND or behind.mean() < _BEHIND:
             continue
         evidence: Evidence = {"detections_behind": int(np.count_nonzero(behind)), "of_all_detections": len(poses)}
-        all_but_axes = behind.all() and name in misfits and misfits[name]["as is", "as is"] < _FITS_DEG
         what = f"{100.0 * behind.mean():.0f} % of the detections are behind the camera: tz is negative"
         fix = (
             "write T_cam_obj with x right, y down, z forward; OpenGL's camera becomes that by diag(1, -1, -1) T_cam_obj"
         )
-        repair = _from_opengl(name) if all_but_axes else None
+        repair = _from_opengl(name) if behind.all() and _fits_map(log, name) else None
         yield Finding("behind-camera", "error", object_poses_file(name), what, fix, evidence, repair)
+
+
+def _fits_map(log: Log, name: str) -> bool:
+    """Tell whether the objects of a set lie beside each other as in the map."""
+    misfit = _misfits(log).get(name)
+    return misfit is not None and misfit["as is", "as is"] < _FITS_DEG
 
 
 def check_rotations_against_map(log: Log) -> Iterator[Finding]:
