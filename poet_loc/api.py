@@ -24,7 +24,7 @@ from poet_loc.report.error_tables import Block, consistency_table, error_table
 from poet_loc.report.evaluate import Estimate, EvaluateOptions, Evaluation
 from poet_loc.report.html import figure_html, fragment, table_html
 from poet_loc.report.log_evaluation import evaluate_log, references_of
-from poet_loc.report.run_record import RunRecord
+from poet_loc.report.run_record import RunRecord, on_camera_clock
 from poet_loc.report.summary import Summary, to_summary
 from poet_loc.report.tables import Table
 
@@ -257,7 +257,7 @@ def _record(results: Sequence[Result], evaluation: Evaluation | None) -> RunReco
     log = results[0].log
     name = next((each.detections for each in results if each.detections is not None), None)
     calibration = log.calibration
-    return RunRecord(
+    record = RunRecord(
         estimates=tuple(each.estimate for each in results),
         references=references_of(log),
         evaluation=evaluation,
@@ -268,6 +268,7 @@ def _record(results: Sequence[Result], evaluation: Evaluation | None) -> RunReco
         camera=None if calibration is None else calibration.camera,
         T_cam_imu=None if calibration is None else calibration.T_cam_imu,
     )
+    return on_camera_clock(record, log.timeshift_ns)
 
 
 def _draw(record: RunRecord, picture: Picture) -> Figure:

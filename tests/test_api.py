@@ -165,6 +165,27 @@ def test_comparison(localized, fused, tmp_path):
     assert both.plot().axes
 
 
+def test_pictures_have_one_clock_however_far_the_two_are_apart(log, fused):
+    later_s = 7.0
+    shift_ns = round(later_s * 1e9)
+    apart = replace(
+        log,
+        calibration=replace(log.calibration, timeshift_cam_imu_s=later_s),
+        imu=replace(log.imu, stamps_ns=log.imu.stamps_ns + shift_ns),
+        T_world_imu=log.T_world_imu.later(shift_ns),
+    )
+    result = poet_loc.fuse(apart)
+    np.testing.assert_array_equal(result.trajectory.stamps_ns, fused.trajectory.stamps_ns + shift_ns)
+    for record in (result.record, poet_loc.evaluate(result, poet_loc.localize(apart)).record):
+        estimate = record.estimates[0]
+        np.testing.assert_array_equal(estimate.trajectory.stamps_ns, fused.trajectory.stamps_ns)
+        np.testing.assert_array_equal(record.fused[0].stamps_ns, fused.result.stamps_ns)
+        np.testing.assert_array_equal(record.fused[0].gate.stamps_ns, fused.result.gate.stamps_ns)
+        np.testing.assert_array_equal(record.references["imu"].stamps_ns, log.T_world_imu.stamps_ns)
+        np.testing.assert_array_equal(record.references["cam"].stamps_ns, log.T_world_cam.stamps_ns)
+        assert record.start_ns == fused.record.start_ns
+
+
 def test_files(localized, fused, tmp_path):
     back = read_tum(fused.to_tum(tmp_path / "T_world_imu.tum"))
     np.testing.assert_array_equal(back.stamps_ns, fused.trajectory.stamps_ns)

@@ -100,7 +100,7 @@ def check_rate(log: Log) -> Iterator[Finding]:
 
 def check_spans(log: Log) -> Iterator[Finding]:
     """Yield streams that have no time, or little of it, in common with the others."""
-    shift_ns = log.calibration.timeshift_ns if log.calibration else 0
+    shift_ns = log.timeshift_ns
     spans = []
     for stream in streams_of(log):
         shift = shift_ns if stream.on_imu_clock else 0
@@ -128,7 +128,7 @@ def check_imu_covers(log: Log) -> Iterator[Finding]:
     """Yield an IMU that was not there for a part of what the camera saw: nothing is fused of that."""
     if log.imu is None or not len(log.imu):
         return
-    shift_ns = log.calibration.timeshift_ns if log.calibration else 0
+    shift_ns = log.timeshift_ns
     begin, end = int(log.imu.stamps_ns[0]), int(log.imu.stamps_ns[-1])
     poses = {object_poses_file(name): each for name, each in log.object_poses.items()}
     for file, each in (poses | {"camera_poses.csv": log.camera_poses}).items():

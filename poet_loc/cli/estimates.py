@@ -23,7 +23,7 @@ from poet_loc.core.records import CameraPoses
 from poet_loc.io.log_folder import Log
 from poet_loc.report.evaluate import Estimate, EvaluateOptions, Evaluation
 from poet_loc.report.log_evaluation import evaluate_log, references_of
-from poet_loc.report.run_record import RunRecord
+from poet_loc.report.run_record import RunRecord, on_camera_clock
 from poet_loc.report.seen_images import images_of
 
 Fusion = Literal[
@@ -73,7 +73,7 @@ class Estimates:
         """What figures, recordings and files take."""
         calibration = self.log.calibration
         found = (None if each.calibrated is None else each.calibrated.landmark_map for each in self.fused)
-        return RunRecord(
+        record = RunRecord(
             estimates=_estimates(self.log, self.localized, self.fused),
             references=references_of(self.log),
             evaluation=self.evaluation,
@@ -85,6 +85,7 @@ class Estimates:
             T_cam_imu=None if calibration is None else calibration.T_cam_imu,
             images=images_of(self.log, self.detections),
         )
+        return on_camera_clock(record, self.log.timeshift_ns)
 
 
 def estimate_log(

@@ -46,6 +46,11 @@ class Log:
     """Odometry: relative motion holds, the frame drifts."""
     frames: Frames | None = None
 
+    @property
+    def timeshift_ns(self) -> int:
+        """What turns a camera stamp into an IMU stamp; 0 without a calibration."""
+        return 0 if self.calibration is None else self.calibration.timeshift_ns
+
     def detections(self, name: str | None = None) -> tuple[str, ObjectPoses]:
         """Return name and poses of one set of detections.
 
@@ -189,13 +194,12 @@ def _refuse_separate_spans(log: Log) -> None:
 
 def _spans_ns(log: Log) -> Iterator[tuple[str, int, int]]:
     """Yield file, first and last stamp of each stream, on the camera's clock."""
-    shift_ns = log.calibration.timeshift_ns if log.calibration else 0
     streams: list[tuple[str, Stamps | None, int]] = [
         *((object_poses_file(name), poses.stamps_ns, 0) for name, poses in log.object_poses.items()),
         ("camera_poses.csv", None if log.camera_poses is None else log.camera_poses.stamps_ns, 0),
-        ("imu.csv", None if log.imu is None else log.imu.stamps_ns, shift_ns),
+        ("imu.csv", None if log.imu is None else log.imu.stamps_ns, log.timeshift_ns),
         ("T_world_cam.tum", None if log.T_world_cam is None else log.T_world_cam.stamps_ns, 0),
-        ("T_world_imu.tum", None if log.T_world_imu is None else log.T_world_imu.stamps_ns, shift_ns),
+        ("T_world_imu.tum", None if log.T_world_imu is None else log.T_world_imu.stamps_ns, log.timeshift_ns),
         ("T_odom_cam.tum", None if log.T_odom_cam is None else log.T_odom_cam.stamps_ns, 0),
         ("frames.csv", None if log.frames is None else log.frames.stamps_ns, 0),
     ]

@@ -64,6 +64,12 @@ class Estimate:
         found = None if fused.calibrated is None else fused.calibrated.timeshift_cam_imu_s
         return cls(fused.name, trajectory, "imu", fused.pose_covariances, fused.runtime_s, False, True, found)
 
+    def on_camera_clock(self, timeshift_ns: int) -> Estimate:
+        """Return the estimate with the camera's stamps, where they are the IMU's."""
+        if not self.on_imu_clock:
+            return self
+        return replace(self, trajectory=self.trajectory.later(-timeshift_ns), on_imu_clock=False)
+
 
 @dataclass(frozen=True)
 class EvaluateOptions:

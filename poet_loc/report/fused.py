@@ -109,6 +109,9 @@ class Fused(HasStates, Protocol):
     def runtime_s(self) -> float | None:
         """s"""
 
+    def later(self, by_ns: int) -> Fused:
+        """The same with stamps, also the gate's, that are later by so much."""
+
     @property
     def calibrated(self) -> Calibrated | None:
         """None where nothing beside the trajectory was estimated"""

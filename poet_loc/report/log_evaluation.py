@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 
 import numpy as np
 
@@ -43,7 +42,7 @@ def evaluate_log(
     detections names the set whose stamps are the sensor's; None: the log's camera poses. All is compared on the
     camera's clock; what an estimate found of it counts where the IMU's ground truth is made of the camera's.
     """
-    references, shift_ns = references_of(log), 0 if log.calibration is None else log.calibration.timeshift_ns
+    references, shift_ns = references_of(log), log.timeshift_ns
     as_found = log.T_world_imu is None
     known = [_on_camera_clock(each, shift_ns, as_found) for each in estimates if each.body in references]
     if not known:
@@ -69,11 +68,9 @@ def evaluate_log(
 
 
 def _on_camera_clock(estimate: Estimate, shift_ns: int, as_found: bool) -> Estimate:
-    if not estimate.on_imu_clock:
-        return estimate
     if as_found and estimate.timeshift_cam_imu_s is not None:
         shift_ns = round(estimate.timeshift_cam_imu_s * 1e9)
-    return replace(estimate, trajectory=estimate.trajectory.later(-shift_ns))
+    return estimate.on_camera_clock(shift_ns)
 
 
 def _file_of(detections: str | None) -> str:

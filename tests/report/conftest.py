@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -44,6 +44,9 @@ class FusedByHand:
     gate: Gate | None
     runtime_s: float | None
     calibrated: SimpleNamespace | None = None
+
+    def later(self, by_ns: int) -> FusedByHand:
+        return replace(self, stamps_ns=self.stamps_ns + by_ns)
 
 
 def _motion(stamps_ns: NDArray) -> Trajectory:
