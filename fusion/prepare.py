@@ -36,6 +36,7 @@ NEAREST_OBJECT = 1e-3  # m
 LEAST_BIAS = 1e-6
 """1-sigma of a bias that is said to be none, rad or share of the distance: errors are measured in it."""
 STANDARD_GRAVITY = 9.81  # m/s^2
+_LEAST_ANGLE = 1e-6  # rad: below it the cosine is 1
 VELOCITY_OF_ODOMETRY = 0.05  # m/s, reported beside the velocity that odometry gives
 
 
@@ -342,7 +343,7 @@ def _start(options: FuseOptions) -> list[float]:
     values = {
         ballot.MIN_VOTES: start.min_votes,
         ballot.LONGEST_WINDOW_S: start.longest_window_s,
-        ballot.MAX_ANGLE: math.radians(start.max_angle_deg),
+        ballot.MAX_ANGLE: min(max(math.radians(start.max_angle_deg), _LEAST_ANGLE), math.pi),
         ballot.MAX_DISTANCE: start.max_distance,
         ballot.MAX_LEVER: start.max_lever,
         ballot.MAX_SPEED: start.max_camera_speed if options.measurements == "camera" else start.max_speed,

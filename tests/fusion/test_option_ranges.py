@@ -48,6 +48,10 @@ def test_no_option_is_nan_or_negative(name, value):
         ("constant_velocity.rate_hz", 0.0),
         ("moved.memory_s", 0.0),
         ("start.min_votes", 0),
+        ("start.max_angle_deg", 0.0),
+        ("start.max_distance", 0.0),
+        ("meeting.max_angle_deg", 0.0),
+        ("meeting.max_distance", 0.0),
     ],
 )
 def test_what_would_divide_by_zero_is_refused(name, value):

@@ -280,3 +280,16 @@ def test_detections_none_of_which_can_be_used_are_told(motion):
     for useless in (poses[:0], replace(poses, T_cam_obj=behind), replace(poses, object_ids=poses.object_ids + 100)):
         with pytest.raises(InputError, match=f"none of {len(useless)} detections"):
             fuse(replace(log, object_poses={"": useless}), FuseOptions(motion=motion))
+
+
+@pytest.mark.parametrize("degrees", [360.0, 500.0])
+def test_votes_that_may_be_turned_anyhow_agree_by_their_places(degrees):
+    options = replace(OPTIONS, start=replace(OPTIONS.start, max_angle_deg=degrees))
+    half_a_turn = replace(OPTIONS, start=replace(OPTIONS.start, max_angle_deg=180.0))
+    log = table([None, None])
+    np.testing.assert_array_equal(fuse(log, options).stamps_ns, fuse(log, half_a_turn).stamps_ns)
+
+
+def test_an_angle_too_small_for_any_votes_to_agree_ends_in_one_line():
+    with pytest.raises(InputError, match="never started"):
+        fuse(table([None]), replace(OPTIONS, start=replace(OPTIONS.start, max_angle_deg=1e-9)))
