@@ -210,13 +210,14 @@ def fuse(
     if lacks_map(log, options):
         log = replace(log, T_world_cam=None, T_world_imu=None)
     object_poses = camera_poses = name = None
+    solver, by_truth = solver or SolverOptions(), False
     if options.measurements == "objects" or log.camera_poses is None:
         name, object_poses = log.detections(detections)
         if options.measurements == "camera":
-            solved = localize(log, _with_detections(solver or SolverOptions(), name)).result.estimates
-            camera_poses = solved.camera_poses[~solved.held]
+            solved = localize(log, _with_detections(solver, name)).result.estimates
+            camera_poses, by_truth = solved.camera_poses[~solved.held], solver.mode in ORACLES
     result = run(log, options, camera_poses=camera_poses, object_poses=object_poses)
-    estimate = replace(Estimate.of_fused(result), body=result.body)
+    estimate = replace(Estimate.of_fused(result), body=result.body, oracle=by_truth)
     return FusedTrajectory(log, name, estimate, result=result)
 
 

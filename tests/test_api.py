@@ -18,6 +18,7 @@ from scipy.spatial.transform import Rotation
 import poet_loc
 from fusion.fuse import fuse as fuse_stage
 from fusion.simulate import SimulationOptions, simulate
+from landmarks.options import SolverOptions
 from poet_loc.core.trajectory import Trajectory
 from poet_loc.io.log_folder import write_log
 from poet_loc.io.tum import read_tum
@@ -150,6 +151,12 @@ def test_errors_are_those_of_the_definition(log, localized):
     np.testing.assert_allclose(row.errors[:, :3], estimated.translation - truth.translation, atol=1e-9)
     rmse = 1e3 * np.sqrt(np.mean(np.sum(row.errors[:, :3] ** 2, axis=1)))
     assert f"RMSE {rmse:.1f} mm" in repr(localized)
+
+
+def test_what_fuses_the_oracles_camera_poses_is_an_oracle(log):
+    loose = replace(poet_loc.FuseOptions(), measurements="camera")
+    assert poet_loc.fuse(log, loose, solver=SolverOptions(mode="best")).estimate.oracle
+    assert not poet_loc.fuse(log, loose, solver=SolverOptions(mode="prev")).estimate.oracle
 
 
 def test_comparison(localized, fused, tmp_path):

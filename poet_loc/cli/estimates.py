@@ -67,6 +67,8 @@ class Estimates:
     fused: tuple[FuseResult, ...]
     evaluation: Evaluation | None
     """None without ground truth."""
+    solver_mode: Mode
+    """Of the solver whose camera poses are fused where the log brings none."""
 
     @property
     def record(self) -> RunRecord:
@@ -74,7 +76,7 @@ class Estimates:
         calibration = self.log.calibration
         found = (None if each.calibrated is None else each.calibrated.landmark_map for each in self.fused)
         record = RunRecord(
-            estimates=_estimates(self.log, self.localized, self.fused),
+            estimates=_estimates(self.log, self.localized, self.fused, self.solver_mode),
             references=references_of(self.log),
             evaluation=self.evaluation,
             fused=self.fused,
@@ -129,8 +131,9 @@ def estimate_log(
         what = "no landmarks.json: the world is that of the object that anchors it, in which ground truth says nothing"
         report.note(f"{log.path}: {what}; poet-loc evaluate --align se3 compares trajectories")
     else:
-        evaluation = evaluate_estimates(log, name, _estimates(log, localized, fused), options.evaluation, report)
-    return Estimates(log, name, localized, fused, evaluation)
+        all_estimates = _estimates(log, localized, fused, options.solver.mode)
+        evaluation = evaluate_estimates(log, name, all_estimates, options.evaluation, report)
+    return Estimates(log, name, localized, fused, evaluation, options.solver.mode)
 
 
 def _tell_of_other_axes(log: Log, detections: str, report: Report) -> None:
@@ -357,7 +360,9 @@ def _localize_options(options: SolverOptions, mode: Mode, detections: str | None
     return LocalizeOptions(**values | {"mode": mode}, detections=detections)
 
 
-def _estimates(log: Log, localized: Sequence[LocalizeResult], fused: Sequence[FuseResult]) -> tuple[Estimate, ...]:
+def _estimates(
+    log: Log, localized: Sequence[LocalizeResult], fused: Sequence[FuseResult], solver_mode: Mode
+) -> tuple[Estimate, ...]:
     given = [] if log.camera_poses is None else [Estimate.of_camera_poses("localize/given", log.camera_poses)]
     solved = [
         Estimate.of_camera_poses(
@@ -368,4 +373,9 @@ def _estimates(log: Log, localized: Sequence[LocalizeResult], fused: Sequence[Fu
         )
         for result in localized
     ]
-    return (*given, *solved, *(replace(Estimate.of_fused(result), body=result.body) for result in fused))
+    by_truth = log.camera_poses is None and solver_mode in ORACLES
+    filtered = [
+        replace(Estimate.of_fused(result), body=result.body, oracle=by_truth and result.name.endswith("/camera"))
+        for result in fused
+    ]
+    return (*given, *solved, *filtered)

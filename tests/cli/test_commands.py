@@ -295,6 +295,13 @@ def test_table_fuses_when_asked(clean_log, capsys):
     assert {"localize/best", "fuse/eskf/objects"} <= set(names)
 
 
+def test_what_fuses_the_oracles_camera_poses_is_an_oracle_too(clean_log, capsys):
+    asked = ["table", str(clean_log), "--modes", "prev", "--with-fusion", "--solver.mode", "best", "--format", "json"]
+    assert main([*asked, "--fusions", "eskf/camera", "eskf/objects"]) == 0
+    rows = {row["name"]: row["oracle"] for row in json.loads(capsys.readouterr().out)}
+    assert rows == {"localize/prev": False, "fuse/eskf/camera": True, "fuse/eskf/objects": False}
+
+
 def test_sensitivity_lists_each_option_with_its_default(clean_log, capsys):
     assert main(["table", str(clean_log), "--sensitivity", "--format", "json"]) == 0
     rows = json.loads(capsys.readouterr().out)
