@@ -56,6 +56,13 @@ def read_calibration(path: str | Path, camera: str = "cam0") -> Calibration:
         )
 
 
+def names_imu_cam(path: str | Path, camera: str = "cam0") -> bool:
+    """Return whether the transform of a camera that `read_calibration` reads stands under the name T_imu_cam."""
+    content = _parse(path, read_text(path))
+    chain = content.get(camera) if isinstance(content, Mapping) else None
+    return isinstance(chain, Mapping) and "T_imu_cam" in chain
+
+
 def write_calibration(path: str | Path, calibration: Calibration) -> None:
     """Write what the calibration has, in Kalibr's names."""
     content: dict[str, Any] = {}

@@ -8,7 +8,7 @@ from typing import Literal
 
 from poet_loc.core.input_error import InputError
 from poet_loc.core.records import Calibration
-from poet_loc.io.calibration_yaml import read_calibration, write_calibration
+from poet_loc.io.calibration_yaml import names_imu_cam, read_calibration, write_calibration
 
 
 @dataclass(frozen=True)
@@ -34,12 +34,14 @@ def convert_kalibr(camchain: str | Path, out: str | Path, options: ConvertKalibr
     out = Path(out)
     target = out if out.suffix in (".yaml", ".yml") else out / "calibration.yaml"
     calibration = read_calibration(camchain, options.camera)
-    if options.holds == "T_imu_cam" and calibration.T_cam_imu is not None and not _named_imu_cam(camchain):
-        calibration = replace(calibration, T_cam_imu=calibration.T_cam_imu.inv())
-    if options.holds == "T_cam_imu" and calibration.T_cam_imu is not None and _named_imu_cam(camchain):
+    named = "T_imu_cam" if names_imu_cam(camchain, options.camera) else "T_cam_imu"
+    if calibration.T_cam_imu is not None and options.holds not in ("as named", named):
         calibration = replace(calibration, T_cam_imu=calibration.T_cam_imu.inv())
     if options.imu is not None:
-        calibration = replace(calibration, imu=read_calibration(options.imu).imu)
+        noise = read_calibration(options.imu).imu
+        if noise is None:
+            raise InputError("has no noise densities of an IMU", path=options.imu, fix="give Kalibr's imu.yaml")
+        calibration = replace(calibration, imu=noise)
     if target.exists():
         if not options.overwrite:
             raise InputError("is there already", path=target, fix="pass --overwrite or choose another place")
@@ -47,7 +49,3 @@ def convert_kalibr(camchain: str | Path, out: str | Path, options: ConvertKalibr
     target.parent.mkdir(parents=True, exist_ok=True)
     write_calibration(target, calibration)
     return calibration
-
-
-def _named_imu_cam(path: str | Path) -> bool:
-    return "T_imu_cam" in Path(path).read_text(encoding="utf-8")

@@ -209,6 +209,24 @@ def test_kalibrs_files_become_a_calibration_in_either_direction(tmp_path, capsys
     np.testing.assert_allclose(kept.T_cam_imu.as_matrix(), read.T_cam_imu.as_matrix(), atol=1e-12)
 
 
+def test_a_comment_or_another_camera_does_not_say_what_the_transform_is(tmp_path) -> None:
+    chain = KALIBR.format(name="T_cam_imu")
+    noted = chain.replace("  T_cam_imu:", "  # T_imu_cam, the driver's people say\n  T_cam_imu:")
+    (tmp_path / "plain.yaml").write_text(chain)
+    (tmp_path / "noted.yaml").write_text(noted + KALIBR.format(name="T_imu_cam").replace("cam0", "cam1"))
+    holds = ConvertKalibrOptions(holds="T_imu_cam")
+    plain = convert_kalibr(tmp_path / "plain.yaml", tmp_path / "a.yaml", holds)
+    told = convert_kalibr(tmp_path / "noted.yaml", tmp_path / "b.yaml", holds)
+    np.testing.assert_array_equal(told.T_cam_imu.as_matrix(), plain.T_cam_imu.as_matrix())
+
+
+def test_an_imu_yaml_without_an_imu_is_refused(tmp_path) -> None:
+    (tmp_path / "cam.yaml").write_text(KALIBR.format(name="T_cam_imu"))
+    options = ConvertKalibrOptions(imu=tmp_path / "cam.yaml")
+    with pytest.raises(InputError, match="no noise densities"):
+        convert_kalibr(tmp_path / "cam.yaml", tmp_path / "log", options)
+
+
 def test_openvins_covariances_are_read(tmp_path) -> None:
     row = "1403715273.262142976 1 2 3 0 0 0 1 .01 .001 .002 .02 .003 .03 .1 .01 .02 .2 .03 .3"
     (tmp_path / "ov.txt").write_text(f"# timestamp tx ..\n{row}\n{row.replace('273.2', '274.2')}\n")
