@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Literal, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -79,7 +79,7 @@ class FuseResult:
     def __len__(self) -> int:
         return len(self.stamps_ns)
 
-    def later(self, by_ns: int) -> FuseResult:
+    def later(self, by_ns: int) -> Self:
         """Return the same states and decisions with stamps that are later by so much: on a clock that is ahead."""
         gate = replace(self.gate, stamps_ns=self.gate.stamps_ns + by_ns)
         return replace(self, stamps_ns=self.stamps_ns + by_ns, gate=gate)

@@ -23,8 +23,8 @@ from poet_loc.io.tum import write_tum
 from poet_loc.report.error_tables import Block, consistency_table, error_table
 from poet_loc.report.evaluate import Estimate, EvaluateOptions, Evaluation
 from poet_loc.report.html import figure_html, fragment, table_html
-from poet_loc.report.log_evaluation import evaluate_log, references_of
-from poet_loc.report.run_record import RunRecord, on_camera_clock
+from poet_loc.report.log_evaluation import evaluate_log, on_camera_clock, references_of
+from poet_loc.report.run_record import RunRecord
 from poet_loc.report.summary import Summary, to_summary
 from poet_loc.report.tables import Table
 
@@ -49,7 +49,7 @@ class Result:
     detections: str | None
     """Name of the set of detections, "" for object_poses.csv; None where the log's camera poses were fused."""
     estimate: Estimate
-    """Name, trajectory, body (cam or imu), (N, 6, 6) pose covariances, runtime."""
+    """Name, trajectory (on the camera's clock), body (cam or imu), (N, 6, 6) pose covariances, runtime."""
 
     @property
     def name(self) -> str:
@@ -58,7 +58,7 @@ class Result:
 
     @property
     def trajectory(self) -> Trajectory:
-        """Stamps and poses: T_world_cam of localize, T_world_imu of fuse."""
+        """Stamps and poses: T_world_cam of localize, T_world_imu of fuse on the IMU's clock."""
         return self.estimate.trajectory
 
     @cached_property
@@ -122,6 +122,11 @@ class FusedTrajectory(Result):
 
     result: FuseResult = field(kw_only=True)
     """Everything that the estimator says: velocity, biases, sigmas, covariances, gate decisions."""
+
+    @property
+    def trajectory(self) -> Trajectory:
+        """Stamps and poses: T_world_imu on the IMU's clock."""
+        return self.result.trajectory
 
     @property
     def calibrated(self) -> Calibrated | None:
@@ -217,7 +222,7 @@ def fuse(
             solved = localize(log, _with_detections(solver, name)).result.estimates
             camera_poses, by_truth = solved.camera_poses[~solved.held], solver.mode in ORACLES
     result = run(log, options, camera_poses=camera_poses, object_poses=object_poses)
-    estimate = replace(Estimate.of_fused(result), body=result.body, oracle=by_truth)
+    estimate = replace(Estimate.of_fused(on_camera_clock(log, result)), body=result.body, oracle=by_truth)
     return FusedTrajectory(log, name, estimate, result=result)
 
 
@@ -258,18 +263,17 @@ def _record(results: Sequence[Result], evaluation: Evaluation | None) -> RunReco
     log = results[0].log
     name = next((each.detections for each in results if each.detections is not None), None)
     calibration = log.calibration
-    record = RunRecord(
+    return RunRecord(
         estimates=tuple(each.estimate for each in results),
         references=references_of(log),
         evaluation=evaluation,
-        fused=tuple(each.result for each in results if isinstance(each, FusedTrajectory)),
+        fused=tuple(on_camera_clock(log, each.result) for each in results if isinstance(each, FusedTrajectory)),
         landmark_map=log.landmark_map,
         detections=None if name is None else log.object_poses[name],
         voted={each.name: each.result.estimates.voted for each in results if isinstance(each, Localization)},
         camera=None if calibration is None else calibration.camera,
         T_cam_imu=None if calibration is None else calibration.T_cam_imu,
     )
-    return on_camera_clock(record, log.timeshift_ns)
 
 
 def _draw(record: RunRecord, picture: Picture) -> Figure:

@@ -22,8 +22,8 @@ from poet_loc.core.input_error import InputError
 from poet_loc.core.records import CameraPoses
 from poet_loc.io.log_folder import Log
 from poet_loc.report.evaluate import Estimate, EvaluateOptions, Evaluation
-from poet_loc.report.log_evaluation import evaluate_log, references_of
-from poet_loc.report.run_record import RunRecord, on_camera_clock
+from poet_loc.report.log_evaluation import evaluate_log, on_camera_clock, references_of
+from poet_loc.report.run_record import RunRecord
 from poet_loc.report.seen_images import images_of
 
 Fusion = Literal[
@@ -75,11 +75,11 @@ class Estimates:
         """What figures, recordings and files take."""
         calibration = self.log.calibration
         found = (None if each.calibrated is None else each.calibrated.landmark_map for each in self.fused)
-        record = RunRecord(
+        return RunRecord(
             estimates=_estimates(self.log, self.localized, self.fused, self.solver_mode),
             references=references_of(self.log),
             evaluation=self.evaluation,
-            fused=self.fused,
+            fused=tuple(on_camera_clock(self.log, result) for result in self.fused),
             landmark_map=self.log.landmark_map or next((each for each in found if each is not None), None),
             detections=None if self.detections is None else self.log.object_poses[self.detections],
             voted={result.name: result.estimates.voted for result in self.localized},
@@ -87,7 +87,6 @@ class Estimates:
             T_cam_imu=None if calibration is None else calibration.T_cam_imu,
             images=images_of(self.log, self.detections),
         )
-        return on_camera_clock(record, self.log.timeshift_ns)
 
 
 def estimate_log(
@@ -376,6 +375,6 @@ def _estimates(
     by_truth = log.camera_poses is None and solver_mode in ORACLES
     filtered = [
         replace(Estimate.of_fused(result), body=result.body, oracle=by_truth and result.name.endswith("/camera"))
-        for result in fused
+        for result in (on_camera_clock(log, each) for each in fused)
     ]
     return (*given, *solved, *filtered)

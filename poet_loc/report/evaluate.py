@@ -13,7 +13,7 @@ from scipy.spatial.transform import RigidTransform
 from poet_loc.core.consistency import pose_nees
 from poet_loc.core.errors import attitude_error, position_error, rotation_angle
 from poet_loc.core.input_error import InputError, within
-from poet_loc.core.records import Calibration, CameraPoses
+from poet_loc.core.records import CameraPoses
 from poet_loc.core.trajectory import Trajectory, nearest_stamps
 from poet_loc.report.fused import Fused
 
@@ -38,16 +38,12 @@ class Estimate:
     """`localize/<mode>` or `fuse/<estimator>/<measurements>`."""
     trajectory: Trajectory
     body: Body
-    """What the trajectory follows: it is compared with the ground truth of that body."""
+    """What the trajectory follows: it is compared with the ground truth of that body, on the same clock."""
     pose_covariances: Array | None = None
     """(N, 6, 6) of [e_r, e_t]: rotation on the right, translation in world axes; rad^2, m^2; NaN: unknown."""
     runtime_s: float | None = None
     oracle: bool = False
     """Whether it looked at the ground truth."""
-    on_imu_clock: bool = False
-    """Whether its stamps are the IMU's: t_imu = t_cam + timeshift_cam_imu."""
-    timeshift_cam_imu_s: float | None = None
-    """As it found it; None: it took the calibration's."""
 
     @classmethod
     def of_camera_poses(
@@ -61,14 +57,7 @@ class Estimate:
     def of_fused(cls, fused: Fused) -> Estimate:
         """Return the estimate that a fused trajectory is."""
         trajectory = Trajectory(fused.stamps_ns, fused.T_world_imu)
-        found = None if fused.calibrated is None else fused.calibrated.timeshift_cam_imu_s
-        return cls(fused.name, trajectory, "imu", fused.pose_covariances, fused.runtime_s, False, True, found)
-
-    def on_camera_clock(self, timeshift_ns: int) -> Estimate:
-        """Return the estimate with the camera's stamps, where they are the IMU's."""
-        if not self.on_imu_clock:
-            return self
-        return replace(self, trajectory=self.trajectory.later(-timeshift_ns), on_imu_clock=False)
+        return cls(fused.name, trajectory, "imu", fused.pose_covariances, fused.runtime_s)
 
 
 @dataclass(frozen=True)
@@ -262,18 +251,15 @@ def pool(evaluations: Iterable[Evaluation]) -> Evaluation:
 
 
 def references_for_both_bodies(
-    references: Mapping[Body, Trajectory], calibration: Calibration
+    references: Mapping[Body, Trajectory], T_cam_imu: RigidTransform | None
 ) -> dict[Body, Trajectory]:
-    """Return the ground truth of camera and IMU, the missing one by way of the extrinsics where they are known.
-
-    Each is on its sensor's own clock.
-    """
-    both, T_cam_imu = dict(references), calibration.T_cam_imu
+    """Return the ground truth of camera and IMU, the missing one by way of the extrinsics where they are known."""
+    both = dict(references)
     if T_cam_imu is not None:
         if "cam" in both and "imu" not in both:
-            both["imu"] = both["cam"].to_body(T_cam_imu).later(calibration.timeshift_ns)
+            both["imu"] = both["cam"].to_body(T_cam_imu)
         elif "imu" in both and "cam" not in both:
-            both["cam"] = both["imu"].to_body(T_cam_imu.inv()).later(-calibration.timeshift_ns)
+            both["cam"] = both["imu"].to_body(T_cam_imu.inv())
     return both
 
 

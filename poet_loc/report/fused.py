@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Protocol
+from typing import Protocol, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -109,7 +109,7 @@ class Fused(HasStates, Protocol):
     def runtime_s(self) -> float | None:
         """s"""
 
-    def later(self, by_ns: int) -> Fused:
+    def later(self, by_ns: int) -> Self:
         """The same with stamps, also the gate's, that are later by so much."""
 
     @property

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import TypeVar
 
 import numpy as np
 
@@ -19,19 +20,33 @@ from poet_loc.report.evaluate import (
     stamps_in_gaps,
     too_sparse,
 )
+from poet_loc.report.fused import Fused
+
+AnyFused = TypeVar("AnyFused", bound=Fused)
 
 
 def references_of(log: Log) -> dict[Body, Trajectory]:
     """Return the ground truth of camera and IMU that a log has, the missing one by way of T_cam_imu.
 
-    The camera's is on the camera's clock, the IMU's on the IMU's.
+    Both are on the camera's clock.
     """
     there: dict[Body, Trajectory] = {}
     if log.T_world_cam is not None:
         there["cam"] = log.T_world_cam
     if log.T_world_imu is not None:
-        there["imu"] = log.T_world_imu
-    return there if log.calibration is None else references_for_both_bodies(there, log.calibration)
+        there["imu"] = log.T_world_imu.later(-log.timeshift_ns)
+    return references_for_both_bodies(there, None if log.calibration is None else log.calibration.T_cam_imu)
+
+
+def on_camera_clock(log: Log, fused: AnyFused) -> AnyFused:
+    """Return what was fused of a log, which is on the IMU's clock, with the camera's stamps.
+
+    The time offset that was found of it counts where the IMU's ground truth is made of the camera's.
+    """
+    found_s = None if fused.calibrated is None else fused.calibrated.timeshift_cam_imu_s
+    if found_s is None or log.T_world_imu is not None:
+        return fused.later(-log.timeshift_ns)
+    return fused.later(-round(found_s * 1e9))
 
 
 def evaluate_log(
@@ -39,16 +54,13 @@ def evaluate_log(
 ) -> Evaluation | None:
     """Return the errors of those estimates whose body the log has ground truth for; None where it has for none.
 
-    detections names the set whose stamps are the sensor's; None: the log's camera poses. All is compared on the
-    camera's clock; what an estimate found of it counts where the IMU's ground truth is made of the camera's.
+    detections names the set whose stamps are the sensor's; None: the log's camera poses. All estimates are on the
+    camera's clock.
     """
-    references, shift_ns = references_of(log), log.timeshift_ns
-    as_found = log.T_world_imu is None
-    known = [_on_camera_clock(each, shift_ns, as_found) for each in estimates if each.body in references]
+    references = references_of(log)
+    known = [estimate for estimate in estimates if estimate.body in references]
     if not known:
         return None
-    if "imu" in references:
-        references["imu"] = references["imu"].later(-shift_ns)
     source = log.camera_poses if detections is None else log.object_poses[detections]
     assert source is not None
     sensor_ns = np.asarray(source.stamps_ns)
@@ -65,12 +77,6 @@ def evaluate_log(
         frames_ns, frames_of = np.union1d(frames_ns, missed_ns), f"{frames_of} and, in its long gaps, {truth_file}"
     span_ns = (int(sensor_ns.min()), int(sensor_ns.max()))
     return evaluate(known, references, span_ns, options, frames_ns, frames_of)
-
-
-def _on_camera_clock(estimate: Estimate, shift_ns: int, as_found: bool) -> Estimate:
-    if as_found and estimate.timeshift_cam_imu_s is not None:
-        shift_ns = round(estimate.timeshift_cam_imu_s * 1e9)
-    return estimate.on_camera_clock(shift_ns)
 
 
 def _file_of(detections: str | None) -> str:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,7 +24,7 @@ DECISIONS = ("refused", "position only", "rotation only", "accepted")
 
 @dataclass(frozen=True)
 class RunRecord:
-    """Estimates, what they were made from, and what is true, as far as it is known; all on one clock."""
+    """Estimates, what they were made from, and what is true, as far as it is known; all on the camera's clock."""
 
     estimates: tuple[Estimate, ...]
     references: Mapping[Body, Trajectory] = field(default_factory=dict)
@@ -66,16 +66,6 @@ class RunRecord:
             if landmark.key == (object_id, instance) and landmark.name:
                 return f"{landmark.name} #{instance}" if instance else str(landmark.name)
         return f"object {object_id}" + (f" #{instance}" if instance else "")
-
-
-def on_camera_clock(record: RunRecord, timeshift_ns: int) -> RunRecord:
-    """Return a record whose IMU trajectories, states and gates have the camera's stamps, as all else in it has."""
-    return replace(
-        record,
-        estimates=tuple(each.on_camera_clock(timeshift_ns) for each in record.estimates),
-        references={body: T.later(-timeshift_ns) if body == "imu" else T for body, T in record.references.items()},
-        fused=tuple(each.later(-timeshift_ns) for each in record.fused),
-    )
 
 
 @dataclass(frozen=True)

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from poet_loc.core.geometry import make_pose
-from poet_loc.core.records import Calibration, Camera, CameraPoses, Landmark, LandmarkMap, ObjectPoses, Symmetry
+from poet_loc.core.records import Camera, CameraPoses, Landmark, LandmarkMap, ObjectPoses, Symmetry
 from poet_loc.core.trajectory import Trajectory
 from poet_loc.report.evaluate import Estimate, evaluate, references_for_both_bodies
 from poet_loc.report.run_record import RunRecord
@@ -126,7 +126,7 @@ def run_record() -> RunRecord:
         Estimate.of_camera_poses("localize/robust", robust, 0.2),
         Estimate.of_fused(fused),
     )
-    references = references_for_both_bodies({"cam": truth}, Calibration(T_CAM_IMU))
+    references = references_for_both_bodies({"cam": truth}, T_CAM_IMU)
     return RunRecord(
         estimates=estimates,
         references=references,

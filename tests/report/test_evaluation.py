@@ -6,11 +6,13 @@ import csv
 import json
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from scipy.spatial.transform import RigidTransform, Rotation
 
+from fusion.result import FuseResult, GateLog
 from poet_loc.core.geometry import make_pose
 from poet_loc.core.input_error import InputError
 from poet_loc.core.records import Calibration, CameraPoses
@@ -25,7 +27,7 @@ from poet_loc.report.evaluate import (
     references_for_both_bodies,
     stamps_in_gaps,
 )
-from poet_loc.report.log_evaluation import evaluate_log
+from poet_loc.report.log_evaluation import evaluate_log, on_camera_clock
 from poet_loc.report.summary import inside_3_sigma, read_summary, to_summary, write_errors_csv, write_summary
 
 START_NS = 1_600_049_000_000_000_000
@@ -247,10 +249,22 @@ def test_where_the_truth_is_missing_it_is_said_why() -> None:
 
 def test_the_other_bodys_truth_follows_from_the_extrinsics() -> None:
     T_cam_imu = RigidTransform.from_exp_coords([0.1, 0.2, 0.3, 1.0, 2.0, 3.0])
-    imu = references_for_both_bodies({"cam": CAMERA}, Calibration(T_cam_imu))["imu"]
-    back = references_for_both_bodies({"imu": imu}, Calibration(T_cam_imu))["cam"]
+    imu = references_for_both_bodies({"cam": CAMERA}, T_cam_imu)["imu"]
+    back = references_for_both_bodies({"imu": imu}, T_cam_imu)["cam"]
     np.testing.assert_allclose(back.T_world_body.as_matrix(), CAMERA.T_world_body.as_matrix(), atol=1e-12)
-    assert set(references_for_both_bodies({"cam": CAMERA}, Calibration())) == {"cam"}
+    assert set(references_for_both_bodies({"cam": CAMERA}, None)) == {"cam"}
+
+
+def fused_by_hand(trajectory: Trajectory, timeshift_found_s: float | None) -> FuseResult:
+    n, none = len(trajectory), np.zeros(0)
+    return FuseResult(
+        "fused",
+        *(trajectory.stamps_ns, trajectory.T_world_body),
+        *(np.zeros((n, 3)), np.zeros((n, 3)), np.zeros((n, 3)), np.ones((n, 15)), np.tile(np.eye(6), (n, 1, 1))),
+        GateLog(*[none.astype(np.int64)] * 3, *[none] * 3, *[none.astype(bool)] * 3),
+        runtime_s=0.0,
+        calibrated=SimpleNamespace(timeshift_cam_imu_s=timeshift_found_s, landmark_map=None),
+    )
 
 
 @pytest.mark.parametrize("known", [("cam", "imu"), ("cam",), ("imu",)])
@@ -274,7 +288,7 @@ def test_errors_are_between_poses_of_one_moment_whatever_separates_the_clocks(
         **{name: each for name, each in truths.items() if name[8:] in known},
     )
     followed = of_imu(stamps(200.0, 400, timeshift_s))
-    fused = Estimate("fused", followed, "imu", on_imu_clock=True, timeshift_cam_imu_s=found_s)
+    fused = Estimate.of_fused(on_camera_clock(log, fused_by_hand(followed, found_s)))
     given = [] if "cam" not in known and found_s is not None else [cam("given", CAMERA)]  # nobody tells its clock
     evaluation = evaluate_log(log, None, [*given, fused], EvaluateOptions())
     assert evaluation is not None
