@@ -23,7 +23,8 @@ def noise_text(noise: DetectionNoise, bias: DetectionBias) -> str:
 def with_noise_from(path: Path | None, options: FuseOptions) -> FuseOptions:
     """Return the options with noise and bias taken from a file, or as they are without one.
 
-    Raises InputError for a file that is not YAML, an unknown option, or a value that is no number.
+    Raises InputError for a file that is not YAML, an unknown option, a value that is no number, and an option that the
+    file has and the options, too, have changed.
     """
     if path is None:
         return options
@@ -34,8 +35,8 @@ def with_noise_from(path: Path | None, options: FuseOptions) -> FuseOptions:
         raise InputError("is not YAML", path=path, line=None if line is None else line + 1, fix=_FIX) from None
     if not isinstance(document, Mapping) or not set(document) <= {"noise", "bias"}:
         raise InputError("has more or less than noise and bias", path=path, fix=_FIX)
-    noise = _changed(options.noise, document.get("noise", {}), path)
-    bias = _changed(options.bias, document.get("bias", {}), path)
+    noise = _changed(options.noise, "noise", document, path)
+    bias = _changed(options.bias, "bias", document, path)
     try:
         return replace(options, noise=noise, bias=bias)
     except InputError as error:
@@ -45,7 +46,8 @@ def with_noise_from(path: Path | None, options: FuseOptions) -> FuseOptions:
 _FIX = "write it with poet-loc fit-noise"
 
 
-def _changed(group: Group, values: Any, path: Path) -> Group:
+def _changed(group: Group, name_of_group: str, document: Mapping[str, Any], path: Path) -> Group:
+    values = document.get(name_of_group, {})
     if not isinstance(values, Mapping):
         raise InputError("noise and bias hold options by name", path=path, fix=_FIX)
     known = {field.name: type(getattr(group, field.name)) for field in fields(group)}
@@ -56,6 +58,9 @@ def _changed(group: Group, values: Any, path: Path) -> Group:
             isinstance(value, bool) != (known[name] is bool) or not isinstance(value, (bool, int, float))
         ):
             raise InputError(f"{name} is {value!r}", path=path, fix=f"give it a {known[name].__name__}")
+        if getattr(group, name) != getattr(type(group)(), name):
+            what = f"has {name_of_group}.{name.replace('_', '-')}, which the command line gives too"
+            raise InputError(what, path=path, fix="leave it out of one of them")
     if "means" in values:
         values = {**values, "means": _rows(values["means"], path)}
     return replace(group, **values)

@@ -31,6 +31,18 @@ def test_fuse_without_varying_biases(clean_log, tmp_path):
     assert main(["fuse", str(clean_log), "--out", str(tmp_path / "run"), "--no-pictures", *none]) == 0
 
 
+def test_an_option_is_not_given_by_the_file_and_by_hand(clean_log, tmp_path, capsys):
+    path = tmp_path / "noise.yaml"
+    path.write_text(noise_text(DetectionNoise(), DetectionBias()))
+    words = ["fuse", str(clean_log), "--out", str(tmp_path / "run"), "--no-pictures", "--noise-from", str(path)]
+    assert main([*words, "--bias.no-use"]) == 1
+    assert f"{path}: has bias.use, which the command line gives too" in one_line(capsys)
+    assert main([*words, "--noise.rotation-deg", "5"]) == 1
+    assert "noise.rotation-deg" in one_line(capsys)
+    path.write_text("noise:\n  across: 0.01\n")
+    assert main([*words, "--noise.rotation-deg", "5"]) == 0
+
+
 def test_mean_errors_go_through_the_file(clean_log, tmp_path, capsys):
     path = tmp_path / "noise.yaml"
     means = ((1, 1.0, -2.0, 0.5, 0.01, 0.0, -0.03), (4, 0.0, 0.0, 0.0, 0.0, 0.0, 0.02))
