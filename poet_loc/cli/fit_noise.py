@@ -11,11 +11,10 @@ import numpy as np
 import tyro
 
 from fusion.fit_noise import FitNoiseOptions, FittedNoise, fit_noise
-from poet_loc.cli.arguments import Flat, refuse_overwrite_without
+from poet_loc.cli.arguments import Flat, refuse_overwrite_without, refuse_twice
 from poet_loc.cli.noise_file import noise_text
-from poet_loc.core.input_error import InputError
 from poet_loc.io.log_folder import read_log
-from poet_loc.io.whole_folder import not_there, write_whole_file
+from poet_loc.io.whole_folder import folder_is_there, not_there, write_whole_file
 
 
 @dataclass(frozen=True)
@@ -38,11 +37,8 @@ def execute(arguments: Arguments) -> None:
     refuse_overwrite_without(arguments.out, "--out", arguments.overwrite)
     if arguments.out is not None:
         not_there(arguments.out, arguments.overwrite)
-    for k, path in enumerate(arguments.logs):
-        if path.resolve() in {other.resolve() for other in arguments.logs[:k]}:
-            raise InputError(
-                "is named twice", path=path, fix="its errors would count as those of two logs: name it once"
-            )
+        folder_is_there(arguments.out)
+    refuse_twice(arguments.logs)
     logs = (read_log(path, arguments.detections) for path in arguments.logs)
     fitted = fit_noise(logs, arguments.detections, arguments.options)
     print("\n".join(_lines(fitted)))

@@ -12,7 +12,7 @@ from typing import Annotated, Literal
 import tyro
 
 from landmarks.options import MODES, Mode
-from poet_loc.cli.arguments import Flat, refuse_overwrite_without
+from poet_loc.cli.arguments import Flat, refuse_overwrite_without, refuse_twice
 from poet_loc.cli.estimates import FUSIONS, Fusion, StageOptions, estimate_log, refuse_one_estimator, steps
 from poet_loc.cli.noise_file import with_noise_from
 from poet_loc.cli.sensitivity_table import sensitivity_rows, sensitivity_tables, sensitivity_text
@@ -20,7 +20,7 @@ from poet_loc.cli.terminal import Report, print_tables, progress
 from poet_loc.cli.unread import refuse_unread
 from poet_loc.core.input_error import InputError
 from poet_loc.io.log_folder import Log, read_log
-from poet_loc.io.whole_folder import write_whole_file
+from poet_loc.io.whole_folder import folder_is_there, write_whole_file
 from poet_loc.report.error_tables import Block, consistency_table, error_table, table_text
 from poet_loc.report.evaluate import Evaluation, pool
 from poet_loc.report.summary import to_summary
@@ -61,8 +61,7 @@ class Arguments:
 
 def execute(arguments: Arguments) -> None:
     """Compute the table and print or write it."""
-    if not arguments.logs:
-        raise InputError("no log was named", fix="poet-loc table LOG [LOG ..]")
+    refuse_twice(arguments.logs)
     refuse_overwrite_without(arguments.out, "--out", arguments.overwrite)
     refuse_one_estimator(arguments.options.fusion)
     form = _form(arguments)
@@ -103,6 +102,7 @@ def _form(arguments: Arguments) -> Format:
         return form or ("rich" if sys.stdout.isatty() else "md")
     if out.exists() and not arguments.overwrite:
         raise InputError("exists already", path=out, fix="choose another --out or pass --overwrite")
+    folder_is_there(out)
     form = form or _OF_SUFFIX.get(out.suffix)
     if form is None or form == "rich":
         raise InputError("no format for this file", path=out, fix="pass --format md, latex, csv or json")

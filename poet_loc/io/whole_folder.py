@@ -40,6 +40,12 @@ def not_there(target: str | Path, overwrite: bool = False) -> None:
         raise InputError("is there already", path=target, fix="choose another name or pass --overwrite")
 
 
+def folder_is_there(target: str | Path) -> None:
+    """Raise InputError for a file to be written where there is no folder: told before the work, not behind it."""
+    if not Path(target).parent.is_dir():
+        raise InputError("lies in no folder that is there", path=target, fix="make the folder or choose another place")
+
+
 @contextmanager
 def whole_folder(target: str | Path, overwrite: bool = False, inputs: Iterable[str | Path] = ()) -> Iterator[Path]:
     """Yield a temporary sibling folder that takes the target's place when the block ends well.

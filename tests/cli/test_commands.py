@@ -289,6 +289,23 @@ def test_table_over_logs_and_detections_in_every_format(clean_log, log, tmp_path
     assert "--format" in one_line(capsys)
 
 
+def test_a_table_counts_no_log_twice(clean_log, capsys):
+    assert main(["table", str(clean_log), str(clean_log / ".." / clean_log.name), "--modes", "prev"]) == 1
+    assert "is named twice" in one_line(capsys)
+
+
+@pytest.mark.parametrize("command", ["table", "fit-noise"])
+def test_a_file_where_no_folder_is_and_a_command_without_logs_are_told_before_the_work(
+    command, clean_log, tmp_path, capsys
+):
+    (tmp_path / "log").mkdir()
+    out = tmp_path / "none" / "out.md"
+    assert main([command, str(tmp_path / "log"), "--out", str(out)]) == 1
+    assert f"{out}: lies in no folder that is there" in one_line(capsys)
+    assert main([command]) == 1
+    assert "no log was named" in one_line(capsys)
+
+
 def test_table_fuses_when_asked(clean_log, capsys):
     assert main(["table", str(clean_log), "--modes", "best", "--with-fusion", "--format", "csv"]) == 0
     names = [line.split(",")[2] for line in capsys.readouterr().out.splitlines()[1:]]
