@@ -15,7 +15,7 @@ from poet_loc.core.errors import (
     relative_pose_error,
     statistics,
 )
-from poet_loc.core.input_error import InputError
+from poet_loc.core.input_error import InputError, within
 from poet_loc.core.trajectory import Trajectory, match_stamps
 from poet_loc.report.evaluate import Estimate, Evaluation, evaluate
 
@@ -34,6 +34,10 @@ class CompareOptions:
     """Metres along the estimate's path, or frames."""
     rpe_all_pairs: bool = False
     """Pairs from every pose instead of one after the other."""
+
+    def __post_init__(self) -> None:
+        within("[0, inf)", self, "max_offset_s")
+        within("(0, inf)", self, "rpe_delta")
 
 
 @dataclass(frozen=True)

@@ -31,6 +31,9 @@ IMAGES, VIDEOS = ["render", "images", "--out", "OUT"], ["render", "videos", "--o
         (RUNS, "workers", "0"),
         (RUNS, "options.evaluation.confidence", "1"),
         (["fit-noise", "LOG"], "longest-lag-s", "0"),
+        (["evaluate", "LOG/T_world_cam.tum", "LOG/T_world_cam.tum"], "rpe-delta", "0"),
+        (["evaluate", "LOG/T_world_cam.tum", "LOG/T_world_cam.tum"], "rpe-delta", "nan"),
+        (["evaluate", "LOG/T_world_cam.tum", "LOG/T_world_cam.tum"], "max-offset-s", "inf"),
         (LOCALIZE, "distance", "-1"),
         (LOCALIZE, "gate-probability", "1"),
         (LOCALIZE, "noise.across", "nan"),
@@ -46,7 +49,8 @@ IMAGES, VIDEOS = ["render", "images", "--out", "OUT"], ["render", "videos", "--o
 )
 def test_an_impossible_number_is_named(command, option, value, clean_log, tmp_path, capsys):
     places = {"LOG": str(clean_log), "OUT": str(tmp_path / "out")}
-    assert main([places.get(word, word) for word in command] + [f"--{option}", value]) == 1
+    words = [places.get(word, word.replace("LOG/", f"{clean_log}/")) for word in command]
+    assert main([*words, f"--{option}", value]) == 1
     assert option.removeprefix("options.evaluation.") in one_line(capsys)
     assert not list(tmp_path.iterdir())
 
