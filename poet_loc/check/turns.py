@@ -27,6 +27,7 @@ _DEGREES = 180.0 / np.pi
 _UNIT_MARGIN = 3.0  # on real detections the scale is off by less than 2
 _FAINT, _ABOVE_CHANCE = 0.2, 0.1  # correlation from which a source tells that much
 _LEAST_IMU = 50  # samples
+_AGREES = 0.02  # correlation that a rotation may lack beside the best one
 _SAME_OFFSET_S = 0.03
 
 
@@ -161,8 +162,7 @@ def _axes(compared: list[_Compared]) -> Iterator[Finding]:
     best = max(told, key=lambda each: each.as_it_is.mirrored)  # type: ignore[union-attr]
     match = best.as_it_is
     assert match is not None
-    margin = 0.02 if match.mirrored > _CLEAN else 0.1
-    if match.mirrored < max(match.correlation, best.match.correlation) + margin:
+    if not _clearly_mirrored(match.mirrored, max(match.correlation, best.match.correlation)):
         return
     if any(each.match.correlation > each.as_it_is.mirrored + 0.03 for each in told):  # type: ignore[union-attr]
         return
@@ -174,6 +174,13 @@ def _axes(compared: list[_Compared]) -> Iterator[Finding]:
     what = "the gyroscope's axes are left-handed: one axis has the wrong sign or two are swapped"
     fix = "turn one axis round (or swap two back), and look at the accelerometer's axes too"
     yield Finding("axes-mirrored", "error", "imu.csv", what, fix, evidence)
+
+
+def _clearly_mirrored(mirrored: float, rotated: float) -> bool:
+    """Whether a reflection fits far better than any rotation, also of inverted poses: of little, a quarter is left."""
+    if mirrored <= _CLEAN:
+        return mirrored >= rotated + 0.1
+    return mirrored >= rotated + 0.02 or (mirrored >= rotated + 0.005 and 1.0 - mirrored < 0.25 * (1.0 - rotated))
 
 
 def _gyroscope_unit(compared: _Compared) -> Iterator[Finding]:
@@ -220,7 +227,7 @@ def _readings(compared: list[_Compared], direction: Direction) -> Iterator[Findi
         best = max(fits, key=lambda reading: fits[reading])
         others = max(fit for reading, fit in fits.items() if reading != best)
         clear = _fits_better(fits[best], fits["as is"]) and fits[best] > others + _CLEAN_MARGIN
-        if best == "as is" or fits[best] < _TELLING or not clear:
+        if best == "as is" or fits[best] < _TELLING or not clear or _is_another_body(each, fits[best]):
             continue
         evidence: Evidence = {f"correlation_{reading.replace(' ', '_')}": fit for reading, fit in fits.items()}
         repair = _reread(each.source.file, best)
@@ -234,12 +241,19 @@ def _readings(compared: list[_Compared], direction: Direction) -> Iterator[Findi
             yield Finding("poses-inverted", "error", each.source.file, what, f"write {name}", evidence, repair)
 
 
+def _is_another_body(compared: _Compared, fit: float) -> bool:
+    """Whether the file as it is, on a body turned otherwise, fits better than the reading of it that fits best."""
+    return compared.as_it_is is not None and compared.as_it_is.correlation > fit
+
+
 def _rotation_off(compared: list[_Compared], R_cam_imu: Rotation) -> Iterator[Finding]:
     telling = [each for each in compared if each.source.body == "cam" and each.fits and each.as_it_is is each.match]
     if not telling:
         return
     best = max(telling, key=lambda each: each.match.correlation)
     written = best.fits["as is", "as is"]
+    if any(each.match.correlation - each.fits["as is", "as is"] < _AGREES for each in telling):
+        return  # then the others are of another body
     if best.match.correlation < 0.6 or not _fits_better(best.match.correlation, written):
         return
     R_cam_imu_data = best.match.R_imu_body.inv()

@@ -156,6 +156,31 @@ def test_one_symmetric_object_does_not_put_the_ground_truth_elsewhere(tmp_path) 
     assert not diagnose(tmp_path).findings
 
 
+@pytest.mark.parametrize(
+    "options",
+    [
+        SimulationOptions(duration_s=15.0, seed=101, odometry=True, camera_poses=True),
+        SimulationOptions(duration_s=15.0, seed=102, odometry=True, camera_poses=True),
+        SimulationOptions(duration_s=6.0, seed=9, camera_rate_hz=15.0, imu_rate_hz=100.0),
+    ],
+)
+@pytest.mark.parametrize("axes", [np.diag([1.0, 1.0, -1.0]), np.eye(3)[[0, 2, 1]]])
+def test_a_gyroscope_that_is_left_handed_is_told_and_nothing_else_is_turned(options, axes, tmp_path) -> None:
+    log = simulate(options)
+    write_log(tmp_path, replace(log, imu=replace(log.imu, angular_velocity=log.imu.angular_velocity @ axes.T)))
+    assert names(diagnose(tmp_path).findings) == {"axes-mirrored"}
+
+
+@pytest.mark.parametrize("seed", [101, 102, 103])
+def test_ground_truth_of_another_body_is_neither_inverted_nor_blamed_on_the_calibration(seed, tmp_path) -> None:
+    log = simulate(SimulationOptions(duration_s=15.0, seed=seed, odometry=True))
+    write_log(tmp_path, replace(log, T_world_cam=log.T_world_imu))
+    findings = diagnose(tmp_path).findings
+    assert {finding.file for finding in findings} == {"T_world_cam.tum"}
+    assert "ground-truth-apart" in names(findings)
+    assert not any(finding.repairable for finding in findings)
+
+
 def test_the_command(good_log, tmp_path, capsys) -> None:
     write_log(tmp_path, good_log)
     assert main(["check", str(tmp_path)]) == 0
