@@ -55,7 +55,7 @@ def read_what_there_is(path: Path) -> tuple[Log, list[Finding]]:
                 record, problems = tolerantly(file)
             except InputError:
                 record, problems = None, []
-            found.extend(problems or [_unreadable(file, error)])
+            found.extend(problems or [_unreadable(file, error, repaired=record is not None)])
             return record
 
     detections = {name: read(file, read_object_poses, _object_poses) for name, file in object_pose_files(path).items()}
@@ -74,9 +74,10 @@ def read_what_there_is(path: Path) -> tuple[Log, list[Finding]]:
     return log, found
 
 
-def _unreadable(file: Path, error: InputError) -> Finding:
+def _unreadable(file: Path, error: InputError, repaired: bool) -> Finding:
     evidence: Evidence = {} if error.line is None else {"line": error.line}
-    return Finding("unreadable", "error", file.name, error.what, error.fix or "correct the file", evidence)
+    fix = error.fix or "correct the file"
+    return Finding("unreadable", "error", file.name, error.what, fix, evidence, repaired_in_reading=repaired)
 
 
 def _not_at_all(file: Path) -> tuple[Any, list[Finding]]:
@@ -142,9 +143,18 @@ def _object_poses(file: Path) -> tuple[ObjectPoses, list[Finding]]:
         found.append(Finding("millimetres", "error", file.name, what, fix, evidence, repaired_in_reading=True))
         rows = replace(rows, numbers=rows.numbers / np.where(np.arange(rows.numbers.shape[1]) < 3, 1000.0, 1.0))
     covariances, bad = _covariances(rows, 8) if has_covariance else (None, [])
-    scores = np.nan_to_num(rows.numbers[:, 7], nan=0.0)
+    scores, unscored = _scores(rows)
     columns = (rows.integers[:, 0], rows.integers[:, 1], rows.integers[:, 2], rows.integers[:, 3])
-    return ObjectPoses(*columns, scores, _poses(rows), covariances), found + bad
+    return ObjectPoses(*columns, scores, _poses(rows), covariances), found + unscored + bad
+
+
+def _scores(rows: Rows) -> tuple[np.ndarray, list[Finding]]:
+    scores = rows.numbers[:, 7]
+    bad: Mask = np.asarray(~np.isfinite(scores))
+    if not bad.any():
+        return scores, []
+    what, fix = "scores are NaN or infinite", "give every detection a score, such as 1; --fix writes 0"
+    return np.where(bad, 0.0, scores), [rows.finding("not-finite", bad, what, fix)]
 
 
 def _covariances(rows: Rows, first: int) -> tuple[np.ndarray, list[Finding]]:

@@ -285,6 +285,20 @@ def nan_rows(rows: list[str]) -> list[str]:
     return [*rows[:10], ",".join([rows[10].split(",")[0], *["nan"] * 6]), *rows[11:]]
 
 
+def unscored_rows(rows: list[str]) -> list[str]:
+    def without(row: str, score: str) -> str:
+        cells = row.split(",")
+        return ",".join([*cells[:4], score, *cells[5:]])
+
+    return [without(rows[0], "nan"), without(rows[1], "inf"), *rows[2:]]
+
+
+def column_too_many(folder: Path) -> None:
+    file = folder / "object_poses.csv"
+    header, *rows = file.read_text().splitlines()
+    file.write_text("\n".join([f"{header},", *(f"{row}," for row in rows)]) + "\n")
+
+
 def long_quaternions(rows: list[str]) -> list[str]:
     def double(row: str) -> str:
         cells = row.split(",")
@@ -394,6 +408,8 @@ SPOILED_FILES: dict[str, tuple[SpoilFolder, set[str], bool]] = {
     "imu rows nan": (lines("imu.csv", nan_rows), {"not-finite"}, True),
     "imu header in degrees": (degrees_in_header, {"imu-header-units"}, True),
     "detection repeated": (lines("object_poses.csv", repeated_row), {"stamps-duplicate"}, True),
+    "detections without score": (lines("object_poses.csv", unscored_rows), {"not-finite"}, True),
+    "a comma at the end of each row": (column_too_many, {"unreadable"}, True),
     "quaternions of norm 2": (lines("object_poses.csv", long_quaternions), {"quaternion-norm"}, True),
     "lever arm in millimetres": (millimetre_lever, {"millimetres"}, True),
     "no map": (lambda folder: (folder / "landmarks.json").unlink(), {"missing"}, False),
