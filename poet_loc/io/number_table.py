@@ -211,7 +211,7 @@ def _wrong_cell(cell: str, dtype: np.dtype[Any]) -> str | None:
     if dtype.kind == "S":
         return None
     try:
-        np.loadtxt([cell], dtype, delimiter=",", comments=None)
+        np.loadtxt([cell], dtype, delimiter="\x1f", comments=None)  # which no cell holds
     except (ValueError, OverflowError):
         return f"holds {shortened(cell)} where a {'whole number of 64 bits' if dtype.kind == 'i' else 'number'} belongs"
     return None

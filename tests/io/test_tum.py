@@ -101,6 +101,7 @@ def test_any_number_of_decimals_is_exact(tmp_path_factory, seconds, decimals):
         ("2.0" + POSE + "1.0" + POSE, 2, "goes backwards"),
         ("1.0" + POSE + "# c\n1.0" + POSE, 3, "there twice"),
         ("1.0" + POSE.replace("1.5", "nan"), 1, "tz is NaN"),
+        ("1.0" + POSE + "2.0" + POSE.replace("1.5", "1,5"), 2, "tz holds '1,5' where a number belongs"),
         ("1.0" + POSE.replace("0.6 0.8", "0 0"), 1, "quaternion is zero"),
         ("1.0" + POSE.replace("0.6 0.8", "0.6 0.9"), 1, "instead of 1"),
     ],
