@@ -11,7 +11,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from poet_loc.core.geometry import make_pose
-from poet_loc.core.input_error import InputError
+from poet_loc.core.input_error import InputError, within
 from poet_loc.core.records import ObjectPoses
 from poet_loc.io.frames_csv import Frames, read_frames
 from poet_loc.io.input_text import read_json
@@ -36,6 +36,9 @@ class ConvertAnnotationOptions:
     """The object poses become object_poses_NAME.csv."""
     overwrite: bool = False
     """Replace an output folder that holds something."""
+
+    def __post_init__(self) -> None:
+        within("(0, inf)", self, "frame_rate")
 
 
 def convert_annotation(
@@ -68,7 +71,7 @@ def _poses(path: Path, options: ConvertAnnotationOptions) -> tuple[Frames, Objec
             whole_number(required(image, "id"), "id"): str(required(image, "file_name")) for image in content["images"]
         }
         rows = [_annotation(row) for row in content["annotations"]]
-    except (FieldError, TypeError, AttributeError) as error:
+    except (ValueError, TypeError, AttributeError) as error:
         raise InputError(str(error), path=path, fix=fix) from None
     if not rows:
         raise InputError("has no annotations", path=path, fix=fix)

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -19,7 +20,7 @@ from poet_loc.core.trajectory import Trajectory
 from poet_loc.io.frames_csv import Frames
 from poet_loc.io.imu_csv import read_imu
 from poet_loc.io.input_text import read_text
-from poet_loc.io.json_fields import FieldError, number, numbers, required, rigid_matrix
+from poet_loc.io.json_fields import number, numbers, required, rigid_matrix
 from poet_loc.io.log_folder import Log, check_log, read_log_files, write_log
 from poet_loc.io.number_table import read_number_csv, write_csv
 from poet_loc.io.pose_columns import pose_cells
@@ -108,15 +109,30 @@ def _frames(path: Path, out: Path) -> Frames:
 
 
 def _calibration(root: Path, camera: str) -> Calibration:
-    imu, cam = (_sensor(root / name / "sensor.yaml") for name in ("imu0", camera))
-    T_body_imu, T_body_cam = _pose(imu), _pose(cam)
+    of_imu, of_camera = (root / name / "sensor.yaml" for name in ("imu0", camera))
+    imu, cam = _sensor(of_imu), _sensor(of_camera)
+    with _told(of_imu):
+        T_body_imu, noise = _pose(imu), _noise(imu)
+    with _told(of_camera):
+        T_body_cam, pinhole = _pose(cam), _camera(cam)
     T_cam_imu = None if T_body_cam is None or T_body_imu is None else T_body_cam.inv() * T_body_imu
-    noise = None
+    return Calibration(T_cam_imu=T_cam_imu, camera=pinhole, imu=noise)
+
+
+@contextmanager
+def _told(path: Path) -> Iterator[None]:
+    try:
+        yield
+    except (ValueError, TypeError, LookupError) as error:
+        raise InputError(str(error), path=path, fix="write it as EuRoC's sensor.yaml does") from None
+
+
+def _noise(imu: Mapping[str, Any]) -> ImuNoise | None:
     names = [name for name in ImuNoise.__dataclass_fields__ if name != "update_rate"]
-    if imu and all(name in imu for name in names):
-        rate = number(imu.get("rate_hz", 200.0), "rate_hz")
-        noise = ImuNoise(update_rate=rate, **{name: number(imu[name], name) for name in names})
-    return Calibration(T_cam_imu=T_cam_imu, camera=_camera(cam) if cam else None, imu=noise)
+    if not all(name in imu for name in names):
+        return None
+    rate = number(imu.get("rate_hz", 200.0), "rate_hz")
+    return ImuNoise(update_rate=rate, **{name: number(imu[name], name) for name in names})
 
 
 def _sensor(path: Path) -> Mapping[str, Any]:
@@ -135,10 +151,7 @@ def _pose(sensor: Mapping[str, Any]) -> RigidTransform | None:
         return None
     matrix = sensor["T_BS"]
     data = matrix["data"] if isinstance(matrix, Mapping) else matrix
-    try:
-        return rigid_matrix(np.reshape(data, (4, 4)).tolist(), "T_BS")
-    except (FieldError, ValueError) as error:
-        raise InputError(f"T_BS: {error}", fix="write 4x4 numbers, rows in order") from None
+    return rigid_matrix(np.reshape(data, (4, 4)).tolist(), "T_BS")
 
 
 def _camera(sensor: Mapping[str, Any]) -> Camera | None:
@@ -146,7 +159,8 @@ def _camera(sensor: Mapping[str, Any]) -> Camera | None:
         return None
     fx, fy, cx, cy = numbers(required(sensor, "intrinsics"), "intrinsics", (4,)).tolist()
     model = _MODELS.get(str(sensor.get("distortion_model", "none")), "none")
-    coefficients = tuple(float(value) for value in sensor.get("distortion_coefficients") or ())
+    written = sensor.get("distortion_coefficients") or ()
+    coefficients = tuple(number(value, "distortion_coefficients") for value in written)
     size = sensor.get("resolution")
     resolution = (int(size[0]), int(size[1])) if size else None
     return Camera((fx, fy, cx, cy), model, () if model == "none" else coefficients, resolution)

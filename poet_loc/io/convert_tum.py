@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
@@ -68,7 +69,7 @@ def _covariances(options: ConvertTumOptions, count: int) -> NDArray[np.float64] 
     position, attitude = options.position_sigma_m, options.attitude_sigma_deg
     if position is None and attitude is None:
         return None
-    if position is None or attitude is None or not (position > 0 and attitude > 0):
+    if position is None or attitude is None or not (0 < position < math.inf and 0 < attitude < math.inf):
         fix = "give --position-sigma-m and --attitude-sigma-deg together, both above zero"
         raise InputError("the sigmas of the camera poses are incomplete", fix=fix)
     sigmas = np.repeat([np.deg2rad(attitude), position], 3)

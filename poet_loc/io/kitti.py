@@ -41,7 +41,12 @@ def write_kitti(path: str | Path, trajectory: Trajectory) -> None:
     rows = _matrices(trajectory.T_world_body).reshape(-1, 12).tolist()
     write_whole_file(path, (" ".join(map(repr, row)) + "\n" for row in rows))
     stamps = (seconds_text(stamp) + "\n" for stamp in trajectory.stamps_ns.tolist())
-    write_whole_file(path.with_name(f"{path.stem}_times.txt"), stamps)
+    write_whole_file(times_beside(path), stamps)
+
+
+def times_beside(path: Path) -> Path:
+    """Return the file of the stamps that `write_kitti` writes beside poses."""
+    return path.with_name(f"{path.stem}_times.txt")
 
 
 def _matrices(T: RigidTransform) -> NDArray[np.float64]:

@@ -17,7 +17,7 @@ from poet_loc.core.geometry import make_pose
 from poet_loc.core.input_error import InputError
 from poet_loc.core.trajectory import Trajectory
 from poet_loc.io.calibration_yaml import read_calibration
-from poet_loc.io.convert_annotation import convert_annotation
+from poet_loc.io.convert_annotation import ConvertAnnotationOptions, convert_annotation
 from poet_loc.io.convert_euroc import convert_euroc, read_euroc_trajectory, write_euroc_trajectory
 from poet_loc.io.convert_kalibr import ConvertKalibrOptions, convert_kalibr
 from poet_loc.io.convert_super6d import ConvertSuper6dOptions, convert_super6d
@@ -289,6 +289,53 @@ def test_poets_annotations_become_object_poses(tmp_path) -> None:
     (tmp_path / "a.json").write_text(json.dumps(content))
     with pytest.raises(InputError, match="rotation is none"):
         convert_annotation(tmp_path / "a.json", tmp_path / "other")
+
+
+@pytest.mark.parametrize("rotation", [["x", 0, 0, 0, 1, 0, 0, 0, 1], [[1, 0], [0, 1], 3]])
+def test_an_annotation_that_holds_no_numbers_is_one_line(rotation, tmp_path) -> None:
+    pose = {"position": [0, 0, 1], "rotation": rotation}
+    content = {
+        "images": [{"id": 0, "file_name": "a.png"}],
+        "annotations": [{"image_id": 0, "category_id": 1, "relative_pose": pose}],
+    }
+    (tmp_path / "a.json").write_text(json.dumps(content))
+    with pytest.raises(InputError, match=r"a\.json"):
+        convert_annotation(tmp_path / "a.json", tmp_path / "log")
+
+
+@pytest.mark.parametrize("rate", [0.0, -30.0, float("nan")])
+def test_a_frame_rate_that_is_none_is_refused(rate) -> None:
+    with pytest.raises(InputError, match="frame-rate"):
+        ConvertAnnotationOptions(frame_rate=rate)
+
+
+@pytest.mark.parametrize(
+    ("sensor", "right", "wrong"),
+    [
+        ("imu0", "rate_hz: 200", "rate_hz: fast"),
+        ("imu0", "2.0000e-3", "much"),
+        ("cam0", "458.654, ", ""),
+        ("cam0", "0.07395907", "a"),
+        ("cam0", "0.07395907, 0.00019359", "[1]"),
+        ("cam0", "0, -1, 0, 0.1", "0, -1, 0, x"),
+        ("cam0", "resolution: [752, 480]", "resolution: 752"),
+    ],
+)
+def test_a_sensor_yaml_that_is_wrong_is_told_by_name(sensor, right, wrong, mav, tmp_path) -> None:
+    file = mav / "mav0" / sensor / "sensor.yaml"
+    assert right in file.read_text()
+    file.write_text(file.read_text().replace(right, wrong))
+    with pytest.raises(InputError) as told:
+        convert_euroc(mav, tmp_path / "log")
+    assert str(told.value).startswith(f"{file}: ")
+
+
+def test_kittis_stamps_are_not_overwritten_either(tmp_path, capsys) -> None:
+    write_tum(tmp_path / "a.tum", TRAJECTORY)
+    (tmp_path / "out_times.txt").write_text("mine\n")
+    assert main(["convert", "to-kitti", str(tmp_path / "a.tum"), str(tmp_path / "out.txt")]) == 1
+    assert "out_times.txt: is there already" in capsys.readouterr().err
+    assert (tmp_path / "out_times.txt").read_text() == "mine\n"
 
 
 @pytest.mark.parametrize("command", ["to-kitti", "to-euroc"])

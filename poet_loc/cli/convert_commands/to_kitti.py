@@ -8,9 +8,9 @@ from typing import Annotated
 
 import tyro
 
-from poet_loc.core.input_error import InputError
-from poet_loc.io.kitti import write_kitti
+from poet_loc.io.kitti import times_beside, write_kitti
 from poet_loc.io.tum import read_tum
+from poet_loc.io.whole_folder import not_there
 
 
 @dataclass(frozen=True)
@@ -27,7 +27,7 @@ class Arguments:
 
 def execute(arguments: Arguments) -> None:
     """Convert."""
-    if arguments.out.exists() and not arguments.overwrite:
-        raise InputError("is there already", path=arguments.out, fix="choose another name or pass --overwrite")
+    for file in (arguments.out, times_beside(arguments.out)):
+        not_there(file, arguments.overwrite)
     write_kitti(arguments.out, read_tum(arguments.trajectory))
     print(arguments.out)
